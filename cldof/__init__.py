@@ -1,0 +1,43 @@
+"""cldof: depth of field for 3D scenes and RGBD layers, with OpenCL on any device."""
+
+from importlib import import_module
+from typing import Any
+
+from .camera import Camera
+from .errors import (
+    BuildError,
+    CaptureError,
+    CldofError,
+    DeviceError,
+    FrameError,
+    InputError,
+    OutputError,
+    SceneError,
+)
+from .frame import LayeredFrame
+from .lens import Lens
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "BuildError",
+    "Camera",
+    "CaptureError",
+    "CldofError",
+    "DeviceError",
+    "FrameError",
+    "InputError",
+    "LayeredFrame",
+    "Lens",
+    "OutputError",
+    "Renderer",
+    "SceneError",
+    "__version__",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # Imported on first use: `import cldof` has to work where OpenCL is not installed.
+    if name == "Renderer":
+        return import_module(".renderer", __name__).Renderer
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,1 @@
+"""Scene in, layered frame out. The only OpenGL code of the project."""

@@ -1,0 +1,242 @@
+"""What a renderer takes: peeled layers of colour and depth, checked once, here."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .camera import Camera
+from .errors import FrameError, OutputError
+from .files import atomic_write
+
+__all__ = ["LayeredFrame"]
+
+_FORMAT_VERSION = 1
+_SURFACE_CHANNELS = {"normal": 3, "albedo": 3, "shininess": None}
+# Peels may repeat a depth (coplanar surfaces, sky behind sky) but never come nearer by more than rounding.
+_ORDER_TOLERANCE = 1e-6
+# A column whose layers let through less than this is closed: float32 rounding of blended alphas.
+_OPAQUE_TOLERANCE = 1e-3
+
+
+class LayeredFrame:
+    """M layers of colour and depth seen by one pinhole camera, front to back.
+
+    A slot with depth ``inf`` and alpha 0 is empty: nothing is there. Depth ``inf`` with alpha above 0 is sky. Arrays
+    that are float32 and C-contiguous already are kept, not copied, and the frame holds read-only views: treat a frame
+    as immutable and make a new one for new pixels, since renderers keep what they derived from it on the device.
+
+    Parameters
+    ----------
+    color : array_like, (M, H, W, 4) or (H, W, 4); RGB with 3 channels counts as opaque
+        Linear light, premultiplied by alpha, unbounded above.
+    depth : array_like, (M, H, W) or (H, W)
+        Planar view-space depth in metres, positive, ``inf`` for nothing there or sky; per pixel not decreasing with M.
+    camera : Camera
+        Its size is that of the image, without the guard band.
+    guard_px : int
+        The arrays reach this many pixels beyond the image on each side, so that light from outside the frame is right.
+    normal, albedo, shininess : array_like, optional
+        Surface buffers for view-dependent shading: (M, H, W, 3) world-space unit normals, (M, H, W, 3) linear albedo,
+        (M, H, W) Phong exponents.
+
+    Raises
+    ------
+    FrameError
+        With the count of bad values and the first pixel that has one.
+    """
+
+    def __init__(
+        self,
+        color: ArrayLike,
+        depth: ArrayLike,
+        camera: Camera,
+        *,
+        guard_px: int = 0,
+        normal: ArrayLike | None = None,
+        albedo: ArrayLike | None = None,
+        shininess: ArrayLike | None = None,
+    ) -> None:
+        if not isinstance(camera, Camera):
+            raise FrameError(f"LayeredFrame needs a cldof.Camera; got {type(camera).__name__}.")
+        if isinstance(guard_px, bool) or guard_px != int(guard_px) or guard_px < 0:
+            raise FrameError(f"guard_px is {guard_px!r}; it must be a whole number of pixels, at least 0.")
+        self.camera = camera
+        self.guard_px = int(guard_px)
+        shape = (camera.height + 2 * self.guard_px, camera.width + 2 * self.guard_px)
+        self.depth = _as_layers(depth, "depth", None, shape)
+        color_array = _as_array(color, "color")
+        if color_array.ndim >= 3 and color_array.shape[-1] == 3:
+            color_array = np.concatenate([color_array, np.ones((*color_array.shape[:-1], 1), np.float32)], axis=-1)
+        self.color = _as_layers(color_array, "color", 4, shape)
+        layers = self.depth.shape[0]
+        if self.color.shape[0] != layers:
+            raise FrameError(f"color has {self.color.shape[0]} layers but depth has {layers}; they must match.")
+        self.surface: dict[str, NDArray[np.float32]] = {}
+        for name, value in (("normal", normal), ("albedo", albedo), ("shininess", shininess)):
+            if value is not None:
+                array = _as_layers(value, name, _SURFACE_CHANNELS[name], shape)
+                if array.shape[0] != layers:
+                    raise FrameError(f"{name} has {array.shape[0]} layers but depth has {layers}; they must match.")
+                _refuse(~np.isfinite(array), name, "NaN or infinite values")
+                self.surface[name] = array
+        self._check_values()
+        for array in (self.color, self.depth, *self.surface.values()):
+            array.setflags(write=False)
+
+    def _check_values(self) -> None:
+        # Comparisons with NaN are false, so each test is written to be true for good values.
+        if not (self.depth > 0.0).all():
+            _refuse(np.isnan(self.depth), "depth", "NaN values; use inf where nothing is there")
+            _refuse(
+                self.depth <= 0.0, "depth", "zero or negative values; depth is planar, in metres, positive in front"
+            )
+        low, high = self.color.min(), self.color.max()
+        if not (low >= 0.0 and high < np.inf):
+            _refuse(~np.isfinite(self.color), "color", "NaN or infinite values")
+            _refuse(self.color < 0.0, "color", "negative values; colour is linear light")
+        alpha = self.color[..., 3]
+        if not alpha.max() <= 1.0 + 1e-5:
+            _refuse(alpha > 1.0 + 1e-5, "color", "alpha above 1; alpha is coverage, premultiplied into RGB")
+        if self.layer_count > 1:
+            nearer = self.depth[1:] < self.depth[:-1] * np.float32(1.0 - _ORDER_TOLERANCE)
+            _refuse(nearer, "depth", "layers out of order; each must be at least as deep as the one before it", first=1)
+
+    @property
+    def layer_count(self) -> int:
+        """M, the number of peeled layers."""
+        return int(self.depth.shape[0])
+
+    @property
+    def height(self) -> int:
+        """Rows of the arrays, guard band included."""
+        return int(self.depth.shape[1])
+
+    @property
+    def width(self) -> int:
+        """Columns of the arrays, guard band included."""
+        return int(self.depth.shape[2])
+
+    @cached_property
+    def inverse_depth_range(self) -> tuple[float, float]:
+        """Smallest and largest ``1/z`` (1/m) of all slots that are not empty; (0, 0) for an empty frame."""
+        nearest = float(self.depth.min())
+        finite = self.depth < np.inf
+        if finite.all():
+            return 1.0 / float(self.depth.max()), 1.0 / nearest
+        sky = bool((self.color[..., 3][~finite] > 0.0).any())
+        if not finite.any():
+            return 0.0, 0.0
+        farthest = float(self.depth.max(initial=0.0, where=finite))
+        return (0.0 if sky else 1.0 / farthest), 1.0 / nearest
+
+    @cached_property
+    def is_opaque(self) -> bool:
+        """True when no pixel of the pinhole image lets the void behind the scene through."""
+        transmittance = 1.0 - self.color[0, ..., 3]
+        for layer in self.color[1:]:
+            if not (transmittance > _OPAQUE_TOLERANCE).any():
+                break
+            transmittance = transmittance * (1.0 - layer[..., 3])
+        return not bool((transmittance > _OPAQUE_TOLERANCE).any())
+
+    def pinhole_image(self) -> NDArray[np.float32]:
+        """All layers composited without any blur: what a lens of radius 0 sees. (H, W, 4), guard band cropped."""
+        guard = self.guard_px
+        inner = slice(guard, -guard or None)
+        color = self.color[:, inner, inner]
+        image: NDArray[np.float32] = color[-1].copy()
+        for layer in color[-2::-1]:
+            image = layer + (1.0 - layer[..., 3:]) * image
+        return image
+
+    def depth_at(self, x: float, y: float) -> float:
+        """Depth in metres of the nearest surface at image pixel ``(x, y)``, to focus on; ``inf`` for sky or void."""
+        camera = self.camera
+        if not (0 <= x < camera.width and 0 <= y < camera.height):
+            raise FrameError(
+                f"Pixel ({x}, {y}) is outside the image of {camera.width}x{camera.height} (x right, y down, from 0)."
+            )
+        return float(self.depth[0, int(y) + self.guard_px, int(x) + self.guard_px])
+
+    def save(self, path: str | Path) -> None:
+        """Write an uncompressed ``.npz``; the file appears whole or not at all.
+
+        Raises
+        ------
+        OutputError
+            If the file cannot be written.
+        """
+        header = {"version": _FORMAT_VERSION, "camera": self.camera.to_dict(), "guard_px": self.guard_px}
+        arrays: dict[str, Any] = {"color": self.color, "depth": self.depth, **self.surface}
+        if Path(path).suffix != ".npz":
+            raise OutputError(f"A frame is saved as .npz; {path} ends otherwise.")
+        with atomic_write(path) as stream:
+            np.savez(stream, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> LayeredFrame:
+        """Read what :meth:`save` wrote. Never unpickles.
+
+        Raises
+        ------
+        FrameError
+            If the file cannot be read or does not hold a frame.
+        """
+        try:
+            if not os.path.isfile(path):
+                raise FrameError(f"Cannot read frame {path}: no such file.")
+            with np.load(path, allow_pickle=False) as data:
+                header = json.loads(bytes(data["header"]).decode())
+                arrays = {name: data[name] for name in ("color", "depth", *_SURFACE_CHANNELS) if name in data}
+            if header["version"] != _FORMAT_VERSION:
+                raise FrameError(
+                    f"Frame {path} has format version {header['version']}; this cldof reads {_FORMAT_VERSION}."
+                )
+            camera, guard_px = Camera.from_dict(header["camera"]), header["guard_px"]
+            color, depth = arrays.pop("color"), arrays.pop("depth")
+        except FrameError:
+            raise
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, MemoryError) as error:
+            raise FrameError(f"{path} is not a frame saved by cldof ({type(error).__name__}: {error}).") from error
+        return cls(color, depth, camera, guard_px=guard_px, **arrays)
+
+    def __repr__(self) -> str:
+        size = f"{self.camera.width}x{self.camera.height}"
+        return f"LayeredFrame({self.layer_count} layers, {size}, guard {self.guard_px} px)"
+
+
+def _as_array(value: ArrayLike, name: str) -> NDArray[np.float32]:
+    array = np.asarray(value)
+    if array.dtype.kind not in "f":
+        raise FrameError(
+            f"{name} has dtype {array.dtype}; give floats (colour in linear light, so decode 8-bit sRGB images first)."
+        )
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def _as_layers(value: ArrayLike, name: str, channels: int | None, size: tuple[int, int]) -> NDArray[np.float32]:
+    array = _as_array(value, name)
+    tail = (*size, channels) if channels else size
+    if array.shape == tail:
+        array = array[np.newaxis]
+    if array.ndim != len(tail) + 1 or array.shape[1:] != tail or array.shape[0] == 0:
+        wanted = "(M, " + ", ".join(str(n) for n in tail) + ")"
+        raise FrameError(
+            f"{name} has shape {array.shape}; the camera and guard band ask for {wanted} or one layer of it."
+        )
+    return array.view()
+
+
+def _refuse(bad: NDArray[np.bool_], name: str, what: str, first: int = 0) -> None:
+    count = int(np.count_nonzero(bad))
+    if count:
+        layer, y, x = np.unravel_index(int(np.argmax(bad)), bad.shape)[:3]
+        raise FrameError(f"{name} has {count} {what}; the first is in layer {layer + first} at pixel x={x}, y={y}.")

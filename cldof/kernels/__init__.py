@@ -1,0 +1,1 @@
+"""OpenCL C sources; read as text by :mod:`cldof.host.program`."""

@@ -1,0 +1,1 @@
+"""Depth-of-field methods: each declares passes and owns no OpenCL object."""
