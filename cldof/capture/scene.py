@@ -1,0 +1,250 @@
+"""What a scene is: meshes with materials, lights, a sky and a camera. Plain data; no OpenGL is needed to build one.
+
+World axes are y up, metres, right-handed; colours are linear light. Objects are shared by identity: nodes that hold the
+same mesh, material and texture objects are uploaded once, and a scene rebuilt around the same objects (an animation)
+uploads nothing new. So treat them as immutable and make new ones for new content.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..errors import SceneError
+
+__all__ = ["Ambient", "DirectionalLight", "Gradient", "Material", "Node", "PointLight", "Scene"]
+
+RGB = tuple[float, float, float]
+RGBA = tuple[float, float, float, float]
+
+
+def _color(value: Iterable[float], name: str, channels: int) -> tuple[float, ...]:
+    color = tuple(float(v) for v in value)
+    if len(color) != channels or not all(0.0 <= v < math.inf for v in color):
+        raise SceneError(f"{name} is {color}; it must be {channels} finite numbers of linear light, none below 0.")
+    return color
+
+
+def _vector(value: Iterable[float], name: str) -> RGB:
+    x, y, z = (float(v) for v in value)
+    if not all(math.isfinite(v) for v in (x, y, z)):
+        raise SceneError(f"{name} is ({x}, {y}, {z}); it must be finite.")
+    return x, y, z
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """How a surface looks: glTF's metallic-roughness model, factors in linear light, textures in 8-bit sRGB.
+
+    Vertex colours of the mesh (linear, as glTF has them), when it has any, multiply ``base_color``.
+
+    Parameters
+    ----------
+    base_color : RGBA, linear
+    base_color_texture, emissive_texture : PIL.Image.Image, optional
+        Multiply their factors; row 0 of the image is at v = 1, as trimesh has it.
+    metallic, roughness : float, 0 to 1
+    emissive : RGB, linear
+        Light given off; above 1 is legal and kept (HDR).
+    alpha_mode : {"opaque", "mask", "blend"}
+        Ignore alpha, cut at ``alpha_cutoff``, or use it as coverage.
+    double_sided : bool
+        Back faces are drawn too, with the normal turned to the viewer.
+    unlit : bool
+        Show base colour (plus emission) as it is.
+    """
+
+    base_color: RGBA = (0.6, 0.6, 0.6, 1.0)
+    base_color_texture: Any = None
+    metallic: float = 0.0
+    roughness: float = 0.6
+    emissive: RGB = (0.0, 0.0, 0.0)
+    emissive_texture: Any = None
+    alpha_mode: str = "opaque"
+    alpha_cutoff: float = 0.5
+    double_sided: bool = False
+    unlit: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "base_color", _color(self.base_color, "Material base_color", 4))
+        object.__setattr__(self, "emissive", _color(self.emissive, "Material emissive", 3))
+        if self.alpha_mode not in ("opaque", "mask", "blend"):
+            raise SceneError(f"Material alpha_mode is {self.alpha_mode!r}; use 'opaque', 'mask' or 'blend'.")
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """One mesh placed in the world.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        Geometry, vertex normals, texture coordinates (``mesh.visual.uv``) and vertex colours are taken from it.
+    transform : array_like, (4, 4)
+        Mesh to world; any affine map that can be inverted.
+    material : Material
+    """
+
+    mesh: trimesh.Trimesh
+    transform: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    material: Material = field(default_factory=Material)
+
+    def __post_init__(self) -> None:
+        transform = np.array(self.transform, dtype=np.float64)
+        if transform.shape != (4, 4) or not np.isfinite(transform).all():
+            raise SceneError(f"Node transform must be a finite 4x4 matrix; got shape {transform.shape}.")
+        transform.setflags(write=False)
+        object.__setattr__(self, "transform", transform)
+
+
+@dataclass(frozen=True)
+class DirectionalLight:
+    """Parallel light travelling along ``direction``; ``color`` is its irradiance over pi, so 1 on white gives 1."""
+
+    direction: RGB
+    color: RGB = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "direction", _vector(self.direction, "DirectionalLight direction"))
+        object.__setattr__(self, "color", _color(self.color, "DirectionalLight color", 3))
+        if not any(self.direction):
+            raise SceneError("DirectionalLight direction is (0, 0, 0); it must point somewhere.")
+
+
+@dataclass(frozen=True)
+class PointLight:
+    """Light from ``position``, falling with the square of distance; ``color`` is what 1 m away gives on white.
+
+    With a ``direction`` it is a spot light: full inside the first of ``cone_deg`` (half angles), none outside the
+    second.
+    """
+
+    position: RGB
+    color: RGB = (1.0, 1.0, 1.0)
+    direction: RGB | None = None
+    cone_deg: tuple[float, float] = (0.0, 45.0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position", _vector(self.position, "PointLight position"))
+        object.__setattr__(self, "color", _color(self.color, "PointLight color", 3))
+        if self.direction is not None:
+            object.__setattr__(self, "direction", _vector(self.direction, "PointLight direction"))
+
+
+@dataclass(frozen=True)
+class Ambient:
+    """Light from everywhere: ``sky`` on surfaces facing up (+y), ``ground`` on those facing down, blended between."""
+
+    sky: RGB = (0.25, 0.25, 0.25)
+    ground: RGB = (0.25, 0.25, 0.25)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sky", _color(self.sky, "Ambient sky", 3))
+        object.__setattr__(self, "ground", _color(self.ground, "Ambient ground", 3))
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """A sky at infinity: ``top`` straight up (+y), ``bottom`` straight down, linear in the sine of elevation."""
+
+    top: RGB
+    bottom: RGB
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "top", _color(self.top, "Gradient top", 3))
+        object.__setattr__(self, "bottom", _color(self.bottom, "Gradient bottom", 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything that a capture needs except the image size and the lens.
+
+    Parameters
+    ----------
+    name : str
+    nodes : sequence of Node
+    camera : Camera, optional
+        A good view; :meth:`camera_for` gives it at any image size.
+    lights : sequence of DirectionalLight and PointLight
+        At most 8 of each kind.
+    ambient : Ambient
+    background : None, RGB or Gradient
+        None is a transparent void; else a sky at infinity, in linear light.
+    focus_distance_m, aperture_radius_m : float, optional
+        Suggestions of whoever made the scene.
+    unlit : bool
+        Show all materials unlit.
+    """
+
+    name: str
+    nodes: tuple[Node, ...]
+    camera: Camera | None = None
+    lights: tuple[DirectionalLight | PointLight, ...] = ()
+    ambient: Ambient = field(default_factory=Ambient)
+    background: RGB | Gradient | None = None
+    focus_distance_m: float | None = None
+    aperture_radius_m: float | None = None
+    unlit: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nodes", tuple(self.nodes))
+        object.__setattr__(self, "lights", tuple(self.lights))
+        if self.background is not None and not isinstance(self.background, Gradient):
+            object.__setattr__(self, "background", _color(self.background, "Scene background", 3))
+        for kind in (DirectionalLight, PointLight):
+            count = sum(isinstance(light, kind) for light in self.lights)
+            if count > 8:
+                raise SceneError(
+                    f"Scene {self.name!r} has {count} lights of kind {kind.__name__}; at most 8 are drawn."
+                )
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """(2, 3) corners of the world-space box around all vertices, in metres.
+
+        Raises
+        ------
+        SceneError
+            If the scene has no vertices.
+        """
+        corners = []
+        for node in self.nodes:
+            if len(node.mesh.vertices):
+                world = trimesh.transform_points(node.mesh.vertices, node.transform)
+                corners += [world.min(axis=0), world.max(axis=0)]
+        if not corners:
+            raise SceneError(f"Scene {self.name!r} is empty: it has no vertices.")
+        return np.array([np.min(corners, axis=0), np.max(corners, axis=0)])
+
+    @property
+    def has_blending(self) -> bool:
+        """True when a material uses alpha as coverage, so that one layer does not make an image."""
+        return any(node.material.alpha_mode == "blend" for node in self.nodes)
+
+    def camera_for(self, width: int, height: int) -> Camera:
+        """The scene's camera at another image size.
+
+        The vertical field of view stays; in an image narrower than the camera's own, the horizontal one stays instead,
+        so that what was framed is still seen.
+
+        Raises
+        ------
+        SceneError
+            If the scene has no camera.
+        """
+        if self.camera is None:
+            raise SceneError(f"Scene {self.name!r} has no camera; give one.")
+        camera = replace(self.camera, width=width, height=height)
+        narrowing = (self.camera.width / self.camera.height) / (width / height)
+        if narrowing <= 1.0:
+            return camera
+        half = math.tan(math.radians(self.camera.yfov_deg) / 2.0)
+        return replace(camera, yfov_deg=math.degrees(2.0 * math.atan(half * narrowing)))
