@@ -1,0 +1,378 @@
+"""Devices: listing, choosing, opening, or taking the caller's; and what may be relied on once one is open."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from ..errors import DeviceError
+from . import opencl as cl
+from .buffers import BufferPool
+from .launch import launch
+from .program import ProgramCache, SourceDirectory
+from .quirks import Effect, effects_of
+
+__all__ = ["Device", "DeviceInfo", "Traits", "list_devices"]
+
+ENVIRONMENT_VARIABLE = "CLDOF_DEVICE"
+
+# Larger groups gain nothing on CPUs, where one work-item's data should stay in registers, nor on GPUs, where 256
+# keeps several groups on one compute unit.
+_PREFERRED_GROUP_LIMIT = 256
+
+_PROBE_SOURCE = """
+__kernel void probe(__global uint *out, __local uint *tile)
+{
+    uint i = get_local_id(0), n = get_local_size(0);
+    tile[i] = i;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    out[i] = tile[n - 1u - i];
+}
+"""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """What a driver says about a device, without opening it.
+
+    Attributes
+    ----------
+    index : int
+        Position in :func:`list_devices`.
+    name, platform, driver_version : str
+    kind : str
+        ``"cpu"``, ``"gpu"`` or ``"other"``.
+    compute_units : int
+    global_mem_bytes : int
+    """
+
+    index: int
+    name: str
+    platform: str
+    driver_version: str
+    kind: str
+    compute_units: int
+    global_mem_bytes: int
+
+    def __str__(self) -> str:
+        return f"{self.index}: {self.name} ({self.kind}, {self.platform}, driver {self.driver_version})"
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What code may branch on. Sizes are in bytes.
+
+    Attributes
+    ----------
+    is_cpu : bool
+    name, platform, driver_version : str
+    compute_units : int
+    global_mem_bytes, max_alloc_bytes, local_mem_bytes : int
+    max_work_group_size : int
+        Found by running a kernel with a barrier, not what the driver says.
+    preferred_group_limit : int
+        Work-group size above which nothing is gained.
+    host_unified_memory : bool
+        Host arrays can be used in place.
+    supports_out_of_order : bool
+        A queue may run commands in any order that events allow.
+    has_int64_atomics : bool
+        The extensions for 64-bit ``atom_add`` and ``atom_min`` are there. Claimed, not probed.
+    """
+
+    is_cpu: bool
+    name: str
+    platform: str
+    driver_version: str
+    compute_units: int
+    global_mem_bytes: int
+    max_alloc_bytes: int
+    local_mem_bytes: int
+    max_work_group_size: int
+    preferred_group_limit: int
+    host_unified_memory: bool
+    supports_out_of_order: bool
+    has_int64_atomics: bool
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Every OpenCL device of this machine, in the drivers' order; empty when there is none.
+
+    Raises
+    ------
+    DeviceError
+        pyopencl is not installed.
+    """
+    return [_info(index, device) for index, device in enumerate(_devices())]
+
+
+class Device:
+    """A context and a queue on one device, with the programs and the memory that belong to them.
+
+    Make one with :meth:`open`, or with :meth:`adopt` from objects of the caller's. Use it as a context manager or call
+    :meth:`close`. Not thread-safe: one per thread.
+
+    Attributes
+    ----------
+    context : pyopencl.Context
+    queue : pyopencl.CommandQueue
+    info : DeviceInfo
+        Its index is -1 for an adopted device.
+    programs : ProgramCache
+    pool : BufferPool
+    is_out_of_order, is_profiling : bool
+        How the queue was made.
+    check_signatures : bool
+        Whether passes are checked against the kernels' argument lists when a frame is compiled. Meant for tests: it
+        relies on what drivers say about arguments.
+    """
+
+    def __init__(
+        self,
+        context: Any,
+        queue: Any,
+        *,
+        index: int = -1,
+        owned: bool = True,
+        sources: SourceDirectory | None = None,
+        check_signatures: bool = False,
+    ) -> None:
+        self.context = context
+        self.queue = queue
+        self.check_signatures = check_signatures
+        self._owned = owned
+        self._cl_device = queue.device
+        self.info = _info(index, self._cl_device)
+        properties = queue.properties
+        self.is_out_of_order = bool(properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE)
+        self.is_profiling = bool(properties & cl.command_queue_properties.PROFILING_ENABLE)
+        self.programs = ProgramCache(context, self._cl_device, sources or files("cldof.kernels"))
+        self.pool = BufferPool(context, queue, shares_memory=_shares_memory(self._cl_device))
+
+    @classmethod
+    def open(
+        cls,
+        choice: int | str | None = None,
+        *,
+        profiling: bool = False,
+        out_of_order: bool = False,
+        sources: SourceDirectory | None = None,
+        check_signatures: bool = False,
+    ) -> Device:
+        """Open a device.
+
+        Parameters
+        ----------
+        choice : int or str, optional
+            An index of :func:`list_devices`, ``"cpu"``, ``"gpu"``, or part of a device's or platform's name in any
+            case. None looks at the environment variable ``CLDOF_DEVICE`` and else takes a GPU, or a CPU if there is
+            none.
+        profiling : bool
+            Have the queue measure every command.
+        out_of_order : bool
+            Ask for an out-of-order queue; a device without one gets an in-order queue.
+        sources : SourceDirectory, optional
+            Kernel files other than the library's own.
+        check_signatures : bool
+            See the attribute.
+
+        Raises
+        ------
+        DeviceError
+            There is no such device; lists those that there are.
+        """
+        devices = _devices()
+        infos = [_info(index, device) for index, device in enumerate(devices)]
+        index = _choose(infos, choice if choice is not None else os.environ.get(ENVIRONMENT_VARIABLE) or None)
+        device = devices[index]
+        try:
+            context = cl.Context([device])
+            queue = _new_queue(context, device, profiling, out_of_order)
+        except cl.Error as error:
+            raise DeviceError(f"device {infos[index]} cannot be opened: {error}. Choose another one.") from error
+        return cls(context, queue, index=index, sources=sources, check_signatures=check_signatures)
+
+    @classmethod
+    def adopt(
+        cls,
+        *,
+        context: Any = None,
+        queue: Any = None,
+        sources: SourceDirectory | None = None,
+        check_signatures: bool = False,
+    ) -> Device:
+        """Work in the caller's context, on the caller's queue or one of our own.
+
+        Parameters
+        ----------
+        context : pyopencl.Context, optional
+            Its first device is used. Not needed with `queue`.
+        queue : pyopencl.CommandQueue, optional
+            Stays the caller's: :meth:`close` leaves it alone.
+        sources, check_signatures
+            As in :meth:`open`.
+        """
+        if queue is None and context is None:
+            raise DeviceError("Device.adopt needs a pyopencl Context or CommandQueue; Device.open makes its own")
+        if queue is not None:
+            if context is not None and queue.context != context:
+                raise DeviceError("the queue given to Device.adopt belongs to another context than the one given")
+            return cls(queue.context, queue, owned=False, sources=sources, check_signatures=check_signatures)
+        queue = _new_queue(context, context.devices[0], profiling=False, out_of_order=False)
+        return cls(context, queue, sources=sources, check_signatures=check_signatures)
+
+    @cached_property
+    def traits(self) -> Traits:
+        """What code may branch on; the first look runs a tiny kernel."""
+        device = self._cl_device
+        extensions = device.extensions.split()
+        return Traits(
+            is_cpu=self.info.kind == "cpu",
+            name=self.info.name,
+            platform=self.info.platform,
+            driver_version=self.info.driver_version,
+            compute_units=device.max_compute_units,
+            global_mem_bytes=device.global_mem_size,
+            max_alloc_bytes=device.max_mem_alloc_size,
+            local_mem_bytes=device.local_mem_size,
+            max_work_group_size=(usable := self._usable_group_size()),
+            preferred_group_limit=min(usable, _PREFERRED_GROUP_LIMIT),
+            host_unified_memory=self.pool.shares_memory,
+            supports_out_of_order=_supports_out_of_order(device),
+            has_int64_atomics={"cl_khr_int64_base_atomics", "cl_khr_int64_extended_atomics"} <= set(extensions),
+        )
+
+    def finish(self) -> None:
+        """Block until everything enqueued is done."""
+        try:
+            self.queue.finish()
+        except cl.Error as error:
+            raise DeviceError(f"{self.info.name} failed while working: {error}") from error
+
+    def close(self) -> None:
+        """Release memory and programs; the queue and the context too, unless they are the caller's."""
+        if self._owned and self.queue is not None:
+            self.queue.finish()
+        self.pool.close()
+        self.programs.clear()
+
+    def __enter__(self) -> Device:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _usable_group_size(self) -> int:
+        """Halve the driver's claim until a kernel with a barrier gives the right answer."""
+        program = cl._cl._Program(self.context, _PROBE_SOURCE)
+        try:
+            program._build(options=b"", devices=[self._cl_device])
+            kernel = cl.Kernel(program, "probe")
+        except cl.Error as error:
+            raise DeviceError(f"{self.info.name} cannot compile the smallest kernel: {error}") from error
+        size: int = self._cl_device.max_work_group_size
+        while size > 1:
+            if self._group_works(kernel, size):
+                return size
+            size //= 2
+        return 1
+
+    def _group_works(self, kernel: Any, size: int) -> bool:
+        buffer = self.pool.acquire(4 * size)
+        try:
+            kernel.set_arg(0, buffer)
+            kernel.set_arg(1, cl.LocalMemory(4 * size))
+            done = launch(self.queue, "probe", cl.enqueue_nd_range_kernel, kernel, (size,), (size,)).event
+            found = self.pool.to_host(buffer, (size,), np.uint32, waits=[done])
+            return bool((found == np.arange(size, dtype=np.uint32)[::-1]).all())
+        except (DeviceError, cl.Error):
+            return False
+        finally:
+            self.pool.release(buffer)
+
+
+def _devices() -> list[Any]:
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:  # the loader found no driver
+        return []
+    devices = []
+    for platform in platforms:
+        try:
+            devices += platform.get_devices()
+        except cl.Error:  # a driver without its device, for instance a GPU driver on a machine without the GPU
+            continue
+    return devices
+
+
+def _info(index: int, device: Any) -> DeviceInfo:
+    kinds = cl.device_type
+    kind = "gpu" if device.type & kinds.GPU else "cpu" if device.type & kinds.CPU else "other"
+    return DeviceInfo(
+        index=index,
+        name=" ".join(device.name.split()),
+        platform=" ".join(device.platform.name.split()),
+        driver_version=device.driver_version,
+        kind=kind,
+        compute_units=device.max_compute_units,
+        global_mem_bytes=device.global_mem_size,
+    )
+
+
+def _choose(infos: Sequence[DeviceInfo], choice: int | str | None) -> int:
+    """Index of the device that a choice means; pure, so that it can be tested without devices."""
+    if not infos:
+        raise DeviceError(
+            "no OpenCL device was found. Any driver will do: a GPU's own, or for the CPU "
+            "pip install 'pyopencl[pocl]', which needs nothing else."
+        )
+    if isinstance(choice, str) and choice.strip().lstrip("-").isdigit():
+        choice = int(choice)
+    if choice is None:
+        matching = list(infos)
+    elif isinstance(choice, int):
+        matching = [info for info in infos if info.index == choice]
+    elif choice.lower() in ("cpu", "gpu"):
+        matching = [info for info in infos if info.kind == choice.lower()]
+    else:
+        part = choice.lower()
+        matching = [info for info in infos if part in info.name.lower() or part in info.platform.lower()]
+    if not matching:
+        raise DeviceError(
+            f"no OpenCL device matches {choice!r}. There is: {'; '.join(map(str, infos))}. Choose by index, by part "
+            f"of a name, 'cpu' or 'gpu', in the call or in the environment variable {ENVIRONMENT_VARIABLE}."
+        )
+    return min(matching, key=_preference).index
+
+
+def _preference(info: DeviceInfo) -> tuple[bool, bool, int]:
+    """Sorts the better device first: no last resorts, GPUs before others, then the drivers' order."""
+    return Effect.LAST_RESORT in effects_of(info.platform, info.name), info.kind != "gpu", info.index
+
+
+def _new_queue(context: Any, device: Any, profiling: bool, out_of_order: bool) -> Any:
+    wanted = cl.command_queue_properties
+    properties = 0
+    if profiling:
+        properties |= wanted.PROFILING_ENABLE
+    if out_of_order and _supports_out_of_order(device):
+        properties |= wanted.OUT_OF_ORDER_EXEC_MODE_ENABLE
+    return cl.CommandQueue(context, device, properties=properties)
+
+
+def _supports_out_of_order(device: Any) -> bool:
+    return bool(device.queue_properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE)
+
+
+def _shares_memory(device: Any) -> bool:
+    # Every CPU device does, whatever the driver says of a query that OpenCL 2.0 deprecated.
+    return bool(device.type & cl.device_type.CPU) or bool(device.host_unified_memory)

@@ -1,0 +1,250 @@
+"""Kernel sources to built programs: include expansion, defines, caching, and build errors that can be read.
+
+Includes are expanded here and no ``-I`` is passed: search paths with a space in them break builds on PoCL and crash
+rusticl. For the same reason programs are built through ``pyopencl._cl``: ``pyopencl.Program.build`` always adds an
+``-I`` of its own, warns whenever a compiler says anything, and leaves a temporary file behind on every failure.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from threading import Lock
+from typing import Any, Protocol
+
+from ..errors import BuildError, InputError
+from . import opencl as cl
+from .quirks import Effect, effects_of
+
+__all__ = ["BUILD_OPTIONS", "Defines", "ProgramCache", "SourceDirectory", "default_cache_dir", "expand", "numbered"]
+
+# One dialect everywhere; argument info lets the scheduler check kernels against passes. No fast-math: see
+# docs/decisions.md.
+BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info")
+
+Defines = tuple[tuple[str, Any], ...]
+
+_INCLUDE = re.compile(r'^\s*#\s*include\s+"(?P<name>[^"]+)"')
+_LINE = re.compile(r'^#line (?P<number>\d+) "(?P<name>[^"]+)"$')
+
+
+class SourceDirectory(Protocol):
+    """A place with kernel files: ``importlib.resources.files("cldof.kernels")`` or a :class:`pathlib.Path`."""
+
+    def joinpath(self, name: str, /) -> Any:
+        """The file of that name, with ``read_text`` and ``is_file``."""
+
+
+def expand(stem: str, defines: Defines, directory: SourceDirectory) -> str:
+    """The text that is compiled: defines, then the file with every ``#include "..."`` replaced by that file.
+
+    Parameters
+    ----------
+    stem : str
+        ``<stem>.cl`` in `directory`.
+    defines : tuple of (str, value) pairs
+        Become ``#define name value`` in that order.
+    directory : SourceDirectory
+
+    Returns
+    -------
+    str
+        With ``#line`` directives, so that compilers speak of the lines of the files.
+
+    Raises
+    ------
+    BuildError
+        A file is missing, or includes itself.
+    """
+    lines = [f"#define {name} {_literal(name, value)}" for name, value in defines]
+    lines += _expanded(f"{stem}.cl", directory, ())
+    return "\n".join(lines) + "\n"
+
+
+def numbered(source: str) -> str:
+    """Expanded source for people: every line with the file and the number that compilers call it by."""
+    out = []
+    name, number = "<defines>", 1
+    for line in source.splitlines():
+        if marker := _LINE.match(line):
+            name, number = marker["name"], int(marker["number"])
+            continue
+        out.append(f"{name}:{number:<4d} | {line}")
+        number += 1
+    return "\n".join(out)
+
+
+def default_cache_dir() -> Path:
+    """Where built programs are kept: ``CLDOF_CACHE_DIR``, or the user's cache directory."""
+    if chosen := os.environ.get("CLDOF_CACHE_DIR"):
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    return (Path(base) if base else Path.home() / ".cache") / "cldof"
+
+
+class ProgramCache:
+    """Builds programs for one device and keeps them, in memory and, where the driver does not, on disk.
+
+    Parameters
+    ----------
+    context : pyopencl.Context
+    device : pyopencl.Device
+    directory : SourceDirectory
+        Where the ``.cl`` and ``.clh`` files are.
+    cache_dir : Path, optional
+        Of the disk cache; :func:`default_cache_dir` unless told otherwise.
+    """
+
+    def __init__(self, context: Any, device: Any, directory: SourceDirectory, cache_dir: Path | None = None) -> None:
+        self._context = context
+        self._device = device
+        self._directory = directory
+        self._programs: dict[str, Any] = {}
+        self._lock = Lock()
+        driver_caches = Effect.DRIVER_CACHES_BUILDS in effects_of(device.platform.name, device.name)
+        self._disk = None if driver_caches else _DiskCache(cache_dir or default_cache_dir())
+
+    def kernel(self, stem: str, name: str, defines: Defines = ()) -> Any:
+        """A new kernel object of ``<stem>.cl``; the program behind it is built at most once.
+
+        New each time, because a kernel object holds its arguments: it belongs to one user on one thread.
+
+        Returns
+        -------
+        pyopencl.Kernel
+
+        Raises
+        ------
+        BuildError
+            The source does not compile, or has no kernel of that name.
+        """
+        program = self.program(stem, defines)
+        try:
+            return cl.Kernel(program, name)
+        except cl.Error as error:
+            found = sorted(program.get_info(cl.program_info.KERNEL_NAMES).split(";"))
+            raise BuildError(f"{stem}.cl has no kernel {name!r}; it has {', '.join(found) or 'none'}") from error
+
+    def program(self, stem: str, defines: Defines = ()) -> Any:
+        """The built program of ``<stem>.cl`` with those defines."""
+        source = expand(stem, defines, self._directory)
+        key = self._key(source)
+        with self._lock:
+            program = self._programs.get(key)
+            if program is None:
+                program = self._programs[key] = self._build(key, source)
+        return program
+
+    def clear(self) -> None:
+        """Forget the programs in memory."""
+        with self._lock:
+            self._programs.clear()
+
+    def _key(self, source: str) -> str:
+        platform = self._device.platform
+        parts = (
+            source,
+            *BUILD_OPTIONS,
+            platform.name,
+            platform.version,
+            self._device.name,
+            self._device.driver_version,
+        )
+        digest = hashlib.sha256()
+        for part in parts:
+            digest.update(part.encode())
+            digest.update(b"\0")  # so that ("ab", "c") and ("a", "bc") differ
+        return digest.hexdigest()
+
+    def _build(self, key: str, source: str) -> Any:
+        if self._disk and (binary := self._disk.load(key)):
+            program = self._from_binary(binary)
+            if program is not None:
+                return program
+        program = cl._cl._Program(self._context, source)
+        try:
+            program._build(options=_encoded(BUILD_OPTIONS), devices=[self._device])
+        except cl.Error as error:
+            raise BuildError(self._report(program, source)) from error
+        if self._disk:
+            self._disk.store(key, program.get_info(cl.program_info.BINARIES)[0])
+        return program
+
+    def _from_binary(self, binary: bytes) -> Any:
+        # A driver may refuse a binary for reasons of its own; the source is still there.
+        try:
+            program = cl._cl._Program(self._context, [self._device], [binary])
+            program._build(options=_encoded(BUILD_OPTIONS), devices=[self._device])
+        except cl.Error:
+            return None
+        return program
+
+    def _report(self, program: Any, source: str) -> str:
+        log = program.get_build_info(self._device, cl.program_build_info.LOG).strip()
+        return (
+            f"a kernel did not compile on {self._device.name.strip()} ({self._device.platform.name}, driver "
+            f"{self._device.driver_version}) with options {' '.join(BUILD_OPTIONS)}\n"
+            f"--- source\n{numbered(source)}\n--- compiler log\n{log or '(empty)'}"
+        )
+
+
+class _DiskCache:
+    """Program binaries by key. A cache that cannot be read or written is the same as an empty one."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+
+    def load(self, key: str) -> bytes | None:
+        try:
+            content = (self._directory / key).read_bytes()
+        except OSError:
+            return None
+        checksum, binary = content[:32], content[32:]
+        return binary if hashlib.sha256(binary).digest() == checksum else None
+
+    def store(self, key: str, binary: bytes) -> None:
+        temporary = None
+        try:
+            self._directory.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=self._directory, delete=False) as file:
+                temporary = Path(file.name)
+                file.write(hashlib.sha256(binary).digest() + binary)
+            temporary.replace(self._directory / key)  # atomic: other processes see all of it or nothing
+        except OSError:
+            if temporary:
+                temporary.unlink(missing_ok=True)
+
+
+def _expanded(name: str, directory: SourceDirectory, above: tuple[str, ...]) -> Iterable[str]:
+    if name in above:
+        raise BuildError(f"kernel file {name} includes itself: {' -> '.join((*above, name))}")
+    file = directory.joinpath(name)
+    if not file.is_file():
+        raise BuildError(
+            f"kernel file {name} does not exist in {directory}" + (f" (included by {above[-1]})" if above else "")
+        )
+    yield f'#line 1 "{name}"'
+    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), start=1):
+        if include := _INCLUDE.match(line):
+            yield from _expanded(include["name"], directory, (*above, name))
+            yield f'#line {number + 1} "{name}"'
+        else:
+            yield line
+
+
+def _literal(name: str, value: Any) -> str:
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, (int, str)):
+        return str(value)
+    if isinstance(value, float):
+        return float.hex(value) + "f"  # exact, and legal in OpenCL C
+    raise InputError(f"compile-time constant {name} = {value!r} must be an int, float, bool or str")
+
+
+def _encoded(options: Sequence[str]) -> bytes:
+    return " ".join(options).encode()

@@ -1,0 +1,120 @@
+"""Vendor workarounds: the one place that looks at vendor names. Everything else branches on traits and probes."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+__all__ = ["QUIRKS", "Effect", "Quirk", "effects_of", "prepare_environment"]
+
+
+class Effect(Enum):
+    """What the library does differently."""
+
+    DRIVER_CACHES_BUILDS = "the driver keeps built programs on disk; ours would only be a second copy"
+    LAST_RESORT = "chosen only by name or index, or when there is nothing else"
+
+
+@dataclass(frozen=True)
+class Quirk:
+    """One row: which devices, what changes, why, where that is known from, and when it was last seen.
+
+    Parameters
+    ----------
+    platform, device : str
+        Lower-case substrings of the platform's and the device's name; an empty one matches all.
+    effect : Effect
+    reason : str
+    source : str
+        Link or measurement.
+    date : str
+        ISO date of the last check.
+    """
+
+    platform: str
+    device: str
+    effect: Effect
+    reason: str
+    source: str
+    date: str
+
+    def matches(self, platform: str, device: str) -> bool:
+        """Whether this row speaks of that device."""
+        return self.platform in platform.lower() and self.device in device.lower()
+
+
+QUIRKS = (
+    Quirk(
+        platform="portable computing language",
+        device="",
+        effect=Effect.DRIVER_CACHES_BUILDS,
+        reason="POCL_CACHE_DIR holds programs and also the work-group functions, which a program binary would not",
+        source="https://portablecl.org/docs/html/env_variables.html",
+        date="2025-11-23",
+    ),
+    Quirk(
+        platform="nvidia cuda",
+        device="",
+        effect=Effect.DRIVER_CACHES_BUILDS,
+        reason="the compute cache (CUDA_CACHE_PATH) is keyed on source and driver",
+        source="https://developer.nvidia.com/blog/cuda-pro-tip-understand-fat-binaries-jit-caching/",
+        date="2025-11-23",
+    ),
+    Quirk(
+        platform="rusticl",
+        device="",
+        effect=Effect.DRIVER_CACHES_BUILDS,
+        reason="Mesa's shader cache keeps compiled kernels",
+        source="https://docs.mesa3d.org/envvars.html (MESA_SHADER_CACHE_DIR)",
+        date="2025-11-23",
+    ),
+    Quirk(
+        platform="",
+        device="llvmpipe",
+        effect=Effect.LAST_RESORT,
+        reason="a conformance device: 17-170 ns per work-item, against 0.3-6 for the other CPU drivers",
+        source="measured, rusticl on llvmpipe, Mesa 22.3",
+        date="2025-11-23",
+    ),
+    Quirk(
+        platform="oclgrind",
+        device="",
+        effect=Effect.LAST_RESORT,
+        reason="a debugger: 30-130 us per pixel",
+        source="measured, oclgrind 21.10",
+        date="2025-11-23",
+    ),
+)
+
+
+def effects_of(platform: str, device: str) -> frozenset[Effect]:
+    """Effects that apply to the device of that name on that platform."""
+    return frozenset(quirk.effect for quirk in QUIRKS if quirk.matches(platform, device))
+
+
+def prepare_environment() -> None:
+    """Give PoCL a cache directory that it can write to; runs before pyopencl is imported.
+
+    Without one, PoCL 3.0 either reports no device at all (home directory missing or read-only, as in many containers)
+    or fails every build. Only a directory that cannot work is replaced, and only where the user set nothing that works.
+    """
+    chosen = os.environ.get("POCL_CACHE_DIR")
+    if chosen is None:
+        base = os.environ.get("XDG_CACHE_HOME")
+        directory = Path(base) if base else Path.home() / ".cache"
+    else:
+        directory = Path(chosen)
+    if not _can_hold_files(directory):
+        owner = os.getuid() if hasattr(os, "getuid") else "user"
+        os.environ["POCL_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"cldof-pocl-{owner}")
+
+
+def _can_hold_files(directory: Path) -> bool:
+    """Whether files can be made in it, or it and its parents can be made. Makes nothing itself."""
+    for path in (directory, *directory.parents):
+        if path.exists():
+            return path.is_dir() and os.access(path, os.W_OK | os.X_OK)
+    return False
