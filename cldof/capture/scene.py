@@ -44,7 +44,7 @@ def _vector(value: Iterable[float], name: str) -> RGB:
 class Material:
     """How a surface looks: glTF's metallic-roughness model, factors in linear light, textures in 8-bit sRGB.
 
-    Vertex colours of the mesh (linear, as glTF has them), when it has any, multiply ``base_color``.
+    Vertex or face colours of the mesh (8-bit, so sRGB, as trimesh has them), when it has any, multiply ``base_color``.
 
     Parameters
     ----------
@@ -87,7 +87,8 @@ class Node:
     Parameters
     ----------
     mesh : trimesh.Trimesh
-        Geometry, vertex normals, texture coordinates (``mesh.visual.uv``) and vertex colours are taken from it.
+        Geometry, ``vertex_normals``, texture coordinates (``visual.uv``) and colours are taken from it. trimesh smooths
+        normals over every edge: :func:`cldof.capture.normals.with_crease_normals` keeps the edges of a box hard.
     transform : array_like, (4, 4)
         Mesh to world; any affine map that can be inverted.
     material : Material
