@@ -85,6 +85,7 @@ class BufferPool:
         self.shares_memory = shares_memory
         self._free: defaultdict[int, list[tuple[Any, Any]]] = defaultdict(list)  # size -> (buffer, last use)
         self._in_use: dict[int, Any] = {}  # address of the OpenCL object -> buffer
+        self._closed = False
         self.allocated_bytes = 0
         self.in_use_bytes = 0
         self.peak_bytes = 0
@@ -101,6 +102,8 @@ class BufferPool:
         DeviceError
             When the device cannot give that much; says how much was asked and how much is held.
         """
+        if self._closed:
+            raise DeviceError("a buffer was asked for after its device was closed")
         if nbytes <= 0:
             raise InputError(f"a device buffer of {nbytes} bytes was asked for; it takes at least 1")
         size = size_class(nbytes)
@@ -120,7 +123,13 @@ class BufferPool:
             From :meth:`acquire`.
         after : pyopencl.Event, optional
             Its last use; it is not handed out again before that is complete.
+
+        Notes
+        -----
+        Nothing happens when the pool is closed: its owner may close it before those who hold buffers.
         """
+        if self._closed:
+            return
         if self._in_use.pop(buffer.int_ptr, None) is None:
             raise InputError("a buffer was released to a pool that had not handed it out, or released twice")
         self.in_use_bytes -= buffer.size
@@ -141,6 +150,7 @@ class BufferPool:
             buffer.release()
         self._in_use.clear()
         self.allocated_bytes = self.in_use_bytes = 0
+        self._closed = True
 
     def to_device(self, array: NDArray[Any], label: str = "upload", waits: Sequence[Any] = ()) -> HostInput:
         """Make a host array readable by kernels: in place where memory is shared, by an unhurried copy elsewhere.
@@ -222,7 +232,8 @@ class BufferPool:
     def _reuse(self, size: int) -> Any:
         kept = self._free[size]
         for position, (buffer, after) in enumerate(kept):
-            if after is None or after.command_execution_status == cl.command_execution_status.COMPLETE:
+            # Below "complete" are the failed ones, which are over as well.
+            if after is None or after.command_execution_status <= cl.command_execution_status.COMPLETE:
                 del kept[position]
                 return buffer
         return None
