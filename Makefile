@@ -1,0 +1,41 @@
+# Each target is the only step: what it needs is installed into .venv first (scripts/setup.sh).
+# PYTHON=python3.12 picks the interpreter, DEVICE=... the OpenCL device, ARGS=... goes to pytest or bench.
+
+VENV := .venv/bin
+DEVICE ?=
+ARGS ?=
+
+export PYTHON
+
+.PHONY: help demo test bench lint clean
+
+help:
+	@echo "make demo   render a built-in scene to out/demo.png (and out/demo-pinhole.png beside it)"
+	@echo "make test   run all tests          (ARGS='-k lens' picks some)"
+	@echo "make bench  time every pass and the whole frame, as ratios to a device copy"
+	@echo "make lint   ruff check, ruff format --check, mypy"
+	@echo "make clean  remove .venv, out/ and caches"
+
+demo:
+	@scripts/setup.sh core
+	@mkdir -p out
+	@$(VENV)/cldof render row -o out/demo.png --pinhole out/demo-pinhole.png --size 1024x768 \
+		$(if $(DEVICE),--device "$(DEVICE)")
+
+test:
+	@scripts/setup.sh test
+	$(VENV)/python -m pytest $(ARGS)
+
+bench:
+	@scripts/setup.sh bench
+	$(VENV)/python -m bench $(ARGS)
+
+lint:
+	@scripts/setup.sh dev
+	$(VENV)/ruff check .
+	$(VENV)/ruff format --check .
+	$(VENV)/mypy
+
+clean:
+	rm -rf .venv out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,95 @@
+#!/usr/bin/env bash
+# Make .venv ready, from nothing: setup.sh core|test
+#
+# Installs what is missing and no more; a second run is instant. Uses apt-get (with sudo when not root) for three
+# things that pip cannot bring: Python's own venv module, the linker that PoCL calls, and an EGL/OpenGL driver.
+# Where apt-get or the right to use it is missing it says what to install and goes on if it can.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+extra=${1:-core}
+venv=.venv
+stamp=$venv/.cldof-$extra
+gl_stamp=$venv/.cldof-gl
+
+say() { printf '%s\n' "cldof setup: $*" >&2; }
+fail() { say "$*"; exit 1; }
+
+as_root() {
+    if [ "$(id -u)" = 0 ]; then "$@"
+    elif ! command -v sudo >/dev/null; then return 1
+    elif [ -t 0 ]; then sudo "$@"
+    else sudo -n "$@"
+    fi
+}
+
+apt_updated=
+apt_install() {
+    command -v apt-get >/dev/null || return 1
+    if [ -z "$apt_updated" ]; then
+        as_root apt-get update -qq >&2 || say "apt-get update failed; trying with the package lists at hand"
+        apt_updated=1
+    fi
+    say "installing $*"
+    as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" </dev/null >&2
+}
+
+new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
+
+find_python() {
+    if [ -n "${PYTHON:-}" ]; then
+        command -v "$PYTHON" >/dev/null || fail "PYTHON=$PYTHON is not a command"
+        new_enough "$PYTHON" || fail "PYTHON=$PYTHON is $("$PYTHON" --version 2>&1); cldof needs Python 3.11 or newer"
+        printf '%s\n' "$PYTHON"
+        return
+    fi
+    local candidate
+    for candidate in python3 python3.13 python3.12 python3.11; do
+        if command -v "$candidate" >/dev/null && new_enough "$candidate"; then
+            printf '%s\n' "$candidate"
+            return
+        fi
+    done
+    fail "no Python 3.11 or newer found (python3 is $(python3 --version 2>&1 || true));" \
+        "install one, or name it: make PYTHON=/path/to/python3.11 ..."
+}
+
+make_venv() {
+    local python package
+    python=$(find_python)
+    say "creating $venv with $("$python" --version 2>&1)"
+    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+        package=python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv
+        apt_install "$package" || fail "$python has no venv module; install the package $package and try again"
+    fi
+    rm -rf "$venv"
+    "$python" -m venv "$venv" || { rm -rf "$venv"; fail "$python could not create $venv"; }
+}
+
+# An existing .venv whose interpreter is gone (an upgrade of the system, a moved folder) is made anew.
+"$venv/bin/python" -c 'import pip' 2>/dev/null || make_venv
+
+if [ ! -e "$stamp" ] || [ setup.cfg -nt "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
+    target=.
+    [ "$extra" = core ] || target=".[$extra]"
+    say "installing cldof and what it needs into $venv (once, a few minutes on a slow line)"
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e "$target"
+    touch "$stamp"
+fi
+
+# PoCL, the OpenCL driver that pip brings, links its kernels with the system's ld and aborts without one.
+if ! command -v ld >/dev/null && ! apt_install binutils; then
+    say "no linker (ld): PoCL cannot build kernels; install the package binutils"
+fi
+
+# Proved by making a context, not by looking for files. Mesa's driver may be quite talkative while it fails.
+have_gl() { "$venv/bin/python" -c 'from cldof.capture.gl_context import probe; probe()' 2>"$venv/gl-probe.log"; }
+
+if [ ! -e "$gl_stamp" ]; then
+    if have_gl || { apt_install libegl1 libgl1 libgl1-mesa-dri && have_gl; }; then
+        touch "$gl_stamp"
+    else
+        say "no offscreen OpenGL here ($(tail -n 1 "$venv/gl-probe.log")): scenes cannot be captured;" \
+            "install libegl1 libgl1 libgl1-mesa-dri. Frames of your own (.npz, arrays) still render."
+    fi
+fi
