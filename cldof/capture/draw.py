@@ -22,9 +22,9 @@ from ..camera import Camera
 from ..errors import CaptureError, SceneError
 from ..lens import Lens
 from .gl_context import import_pyrender
-from .scene import DirectionalLight, Gradient, Material, Node, PointLight, Scene
+from .scene import DirectionalLight, Gradient, Node, PointLight, Scene
 
-pyrender = import_pyrender()
+pyrender: Any = import_pyrender()
 
 from OpenGL import GL as gl  # noqa: E402
 from OpenGL.error import Error as GLError  # noqa: E402
@@ -32,7 +32,7 @@ from OpenGL.error import Error as GLError  # noqa: E402
 __all__ = ["PassOptions", "SceneRenderer", "Target", "View", "opengl_errors"]
 
 _SHADER_HEADER = "#version 330 core\n"
-_PREVIOUS_UNIT, _BASE_UNIT, _EMISSIVE_UNIT = 0, 1, 2
+_PREVIOUS_UNIT, _BASE_UNIT, _EMISSIVE_UNIT, _ROUGHNESS_UNIT = 0, 1, 2, 3
 
 
 @contextmanager
@@ -231,11 +231,12 @@ def _build_failure(name: str, defines: dict[str, int], log: bytes | str, source:
     return CaptureError(f"Shader {name} with {defines} did not compile:\n{log.strip()}\n{numbered}")
 
 
-class _SrgbTexture(pyrender.Texture):  # type: ignore[misc]
-    """An 8-bit sRGB texture that OpenGL decodes before it filters; trilinear, repeating."""
+class _Texture(pyrender.Texture):  # type: ignore[misc]
+    """An 8-bit texture, trilinear and repeating; colours are sRGB, which OpenGL decodes before it filters."""
 
-    def __init__(self, image: Any) -> None:
+    def __init__(self, image: Any, is_color: bool) -> None:
         super().__init__(source=np.asarray(image.convert("RGBA")), source_channels="RGBA")
+        self._format = gl.GL_SRGB8_ALPHA8 if is_color else gl.GL_RGBA8
 
     def _add_to_context(self) -> None:
         texels = np.ascontiguousarray(self.source[::-1])
@@ -243,9 +244,7 @@ class _SrgbTexture(pyrender.Texture):  # type: ignore[misc]
         gl.glActiveTexture(gl.GL_TEXTURE0 + _BASE_UNIT)
         gl.glBindTexture(gl.GL_TEXTURE_2D, self._texid)
         height, width = texels.shape[:2]
-        gl.glTexImage2D(
-            gl.GL_TEXTURE_2D, 0, gl.GL_SRGB8_ALPHA8, width, height, 0, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, texels
-        )
+        gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, self._format, width, height, 0, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, texels)
         gl.glGenerateMipmap(gl.GL_TEXTURE_2D)
         gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_LINEAR)
         gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
@@ -281,7 +280,7 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
         self._scene: Scene | None = None
         self._items: list[_Item] = []
         self._uploads: dict[tuple[int, int], tuple[Any, Any, Any]] = {}  # (mesh, material) ids -> them, pyrender mesh
-        self._textures: dict[int, tuple[Any, _SrgbTexture]] = {}  # image id -> image, texture
+        self._textures: dict[tuple[int, bool], tuple[Any, _Texture]] = {}  # (image id, is colour) -> image, texture
         self._programs: dict[tuple[Any, ...], _Program] = {}
         self._empty_vertex_array = gl.glGenVertexArrays(1)
         self._query = int(np.ravel(gl.glGenQueries(1))[0])  # an array in some PyOpenGL versions
@@ -301,14 +300,18 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
             if not len(node.mesh.faces):
                 continue
             key = (id(node.mesh), id(node.material))
-            images = (node.material.base_color_texture, node.material.emissive_texture)
-            used = []
-            for image in images:
-                if image is not None and id(image) not in textures:
-                    textures[id(image)] = self._textures.get(id(image)) or (image, _SrgbTexture(image))
-                used.append(None if image is None else textures[id(image)][1])
+            material, used = node.material, []
+            for image, is_color in (
+                (material.base_color_texture, True),
+                (material.emissive_texture, True),
+                (material.metallic_roughness_texture, False),
+            ):
+                name = (id(image), is_color)
+                if image is not None and name not in textures:
+                    textures[name] = self._textures.get(name) or (image, _Texture(image, is_color))
+                used.append(None if image is None else textures[name][1])
             if key not in uploads:
-                uploads[key] = self._uploads.get(key) or (node.mesh, node.material, _upload_mesh(node.mesh, *used))
+                uploads[key] = self._uploads.get(key) or (node.mesh, material, _upload_mesh(node.mesh, used))
             mesh = uploads[key][2]
             graph.add(mesh)
             items.append(_item(scene, node, mesh.primitives[0], used))
@@ -336,6 +339,7 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
                 "previous": _PREVIOUS_UNIT,
                 "base_texture": _BASE_UNIT,
                 "emissive_texture": _EMISSIVE_UNIT,
+                "metallic_roughness_texture": _ROUGHNESS_UNIT,
                 "first_layer": previous is None,
                 "zero_to_one": self._zero_to_one,
                 "lens_reach": -1.0 if options.lens_reach_m is None else float(options.lens_reach_m),
@@ -422,9 +426,8 @@ def _item(scene: Scene, node: Node, primitive: Any, textures: list[Any]) -> _Ite
     if primitive.color_0 is not None:
         defines["COLOR_LOCATION"] = location
     units = {}
-    for name, unit, texture in zip(
-        ("BASE_TEXTURE", "EMISSIVE_TEXTURE"), (_BASE_UNIT, _EMISSIVE_UNIT), textures, strict=True
-    ):
+    kinds = (("BASE_TEXTURE", _BASE_UNIT), ("EMISSIVE_TEXTURE", _EMISSIVE_UNIT), ("ROUGHNESS_TEXTURE", _ROUGHNESS_UNIT))
+    for (name, unit), texture in zip(kinds, textures, strict=True):
         if texture is not None and "UV_LOCATION" in defines:
             defines[name], units[unit] = 1, texture
     if material.alpha_mode != "opaque":
@@ -451,26 +454,28 @@ def _item(scene: Scene, node: Node, primitive: Any, textures: list[Any]) -> _Ite
     )
 
 
-def _upload_mesh(mesh: trimesh.Trimesh, base: Any, emissive: Any) -> Any:
+def _upload_mesh(mesh: trimesh.Trimesh, textures: list[Any]) -> Any:
     """A pyrender mesh of one primitive; the material only tells pyrender which textures it owns."""
     visual, faces = mesh.visual, np.asarray(mesh.faces)
     positions, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     uv = getattr(visual, "uv", None)
     colors = None
-    if visual.defined and visual.kind == "face":  # one colour a face: no vertex can be shared
+    if visual.defined and visual.kind == "texture":
+        colors = _linear_colors(visual.vertex_attributes.get("color"))
+    elif visual.defined and visual.kind == "face":  # one colour a face: no vertex can be shared
         positions, normals = positions[faces.ravel()], normals[faces.ravel()]
-        colors = np.repeat(np.asarray(visual.face_colors), 3, axis=0)
+        colors = srgb_bytes_to_linear(np.repeat(np.asarray(visual.face_colors), 3, axis=0))
         uv, faces = None, np.arange(len(positions)).reshape(-1, 3)
     elif visual.defined and visual.kind == "vertex":
-        colors = np.asarray(visual.vertex_colors)
-    if colors is not None:
-        colors = srgb_bytes_to_linear(colors)
+        colors = srgb_bytes_to_linear(np.asarray(visual.vertex_colors))
     primitive = pyrender.Primitive(
         positions=positions,
         normals=normals,
         texcoord_0=None if uv is None or len(uv) != len(positions) else np.asarray(uv),
         color_0=colors,
-        material=pyrender.MetallicRoughnessMaterial(baseColorTexture=base, emissiveTexture=emissive),
+        material=pyrender.MetallicRoughnessMaterial(
+            baseColorTexture=textures[0], emissiveTexture=textures[1], metallicRoughnessTexture=textures[2]
+        ),
     )
     primitive._indices = faces.astype(np.uint32)  # the property would store float32, which skips above 2**24
     return pyrender.Mesh([primitive])
@@ -482,6 +487,17 @@ def srgb_bytes_to_linear(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
     table = np.where(table <= 0.04045, table / 12.92, ((table + 0.055) / 1.055) ** 2.4)
     linear = table[colors].astype(np.float32)
     linear[:, 3] = colors[:, 3] / np.float32(255.0)
+    return linear
+
+
+def _linear_colors(colors: Any) -> NDArray[np.float32] | None:
+    """glTF vertex colours, floats or normalised integers, RGB or RGBA, as linear float32 RGBA."""
+    if colors is None:
+        return None
+    array = np.asarray(colors)
+    scale = np.iinfo(array.dtype).max if array.dtype.kind in "iu" else 1.0
+    linear = np.ones((len(array), 4), np.float32)
+    linear[:, : array.shape[1]] = array / scale
     return linear
 
 

@@ -17,8 +17,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
-
 from ..errors import CaptureError
 
 __all__ = ["GLContext", "import_pyrender"]
@@ -39,7 +37,7 @@ def _unavailable(what: object) -> CaptureError:
 
 
 def import_pyrender() -> Any:
-    """Import pyrender on EGL, past what newer Python, numpy and a machine without X11 break in it.
+    """Import pyrender on EGL, past what newer Python and a machine without X11 break in it.
 
     Raises
     ------
@@ -53,8 +51,6 @@ def import_pyrender() -> Any:
             return loaded
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
         try:
-            if not hasattr(np, "infty"):  # gone in numpy 2; pyrender's Mesh.bounds uses it
-                np.infty = np.inf  # type: ignore[attr-defined]
             from OpenGL.plugins import FormatHandler
 
             # PyOpenGL before 3.1.8 does not know what byref() returns on Python 3.12 and later.

@@ -49,6 +49,7 @@ class DepthPeeler:
     def __init__(self, width: int = 512, height: int = 512) -> None:
         self._size = (width, height)
         self._targets: list[Any] = []
+        self._target_kind: tuple[int, int, bool] | None = None
         self._context = GLContext()
         try:
             with self._context.current():
@@ -162,7 +163,7 @@ class DepthPeeler:
         from .draw import Target, opengl_errors
 
         wanted = (width, height, surface)
-        if self._targets and self._target_kind == wanted:
+        if self._target_kind == wanted:
             return self._targets
         limit = self._renderer.max_side_px
         if max(width, height) > limit:
@@ -176,7 +177,7 @@ class DepthPeeler:
     def _free_targets(self) -> None:
         for target in self._targets:
             target.delete()
-        self._targets = []
+        self._targets, self._target_kind = [], None
 
     def close(self) -> None:
         """Free the context and everything in it; again is harmless."""

@@ -44,7 +44,8 @@ def _vector(value: Iterable[float], name: str) -> RGB:
 class Material:
     """How a surface looks: glTF's metallic-roughness model, factors in linear light, textures in 8-bit sRGB.
 
-    Vertex or face colours of the mesh (8-bit, so sRGB, as trimesh has them), when it has any, multiply ``base_color``.
+    Vertex or face colours of the mesh, when it has any, multiply ``base_color``: 8-bit ones (trimesh's ``visual``) are
+    sRGB, a ``"color"`` attribute of textured meshes is linear.
 
     Parameters
     ----------
@@ -52,6 +53,8 @@ class Material:
     base_color_texture, emissive_texture : PIL.Image.Image, optional
         Multiply their factors; row 0 of the image is at v = 1, as trimesh has it.
     metallic, roughness : float, 0 to 1
+    metallic_roughness_texture : PIL.Image.Image, optional
+        Multiplies them: green is roughness, blue is metallic, linear.
     emissive : RGB, linear
         Light given off; above 1 is legal and kept (HDR).
     alpha_mode : {"opaque", "mask", "blend"}
@@ -66,6 +69,7 @@ class Material:
     base_color_texture: Any = None
     metallic: float = 0.0
     roughness: float = 0.6
+    metallic_roughness_texture: Any = None
     emissive: RGB = (0.0, 0.0, 0.0)
     emissive_texture: Any = None
     alpha_mode: str = "opaque"

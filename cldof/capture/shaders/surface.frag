@@ -1,5 +1,5 @@
 // surface.frag: one fragment of one peel: peel test, back faces, alpha, light.
-// Defines: BASE_TEXTURE, EMISSIVE_TEXTURE, LIT, MASK, BLEND, DOUBLE_SIDED, SURFACE.
+// Defines: BASE_TEXTURE, EMISSIVE_TEXTURE, ROUGHNESS_TEXTURE, LIT, MASK, BLEND, DOUBLE_SIDED, SURFACE.
 // Shading sees the lens centre from every lens point, so that layers and lens views show the same colours.
 
 #include "peel.glsl"
@@ -25,6 +25,9 @@ uniform sampler2D base_texture;
 #ifdef EMISSIVE_TEXTURE
 uniform sampler2D emissive_texture;
 #endif
+#ifdef ROUGHNESS_TEXTURE
+uniform sampler2D metallic_roughness_texture;
+#endif
 
 // Camera-space normal of the triangle, pointing out of its front.
 vec3 front_normal() {
@@ -41,6 +44,13 @@ void main() {
 #endif
 #ifdef EMISSIVE_TEXTURE
     emission *= texture(emissive_texture, surface_uv).rgb;
+#endif
+    float metal = metallic;
+    float rough = roughness;
+#ifdef ROUGHNESS_TEXTURE
+    vec4 texel = texture(metallic_roughness_texture, surface_uv);
+    metal *= texel.b;
+    rough *= texel.g;
 #endif
     vec3 front = front_normal();
 
@@ -66,7 +76,7 @@ void main() {
 #endif
     if (turn && dot(front, camera_position) > 0.0) normal = -normal;
 #ifdef LIT
-    vec3 color = emission + shade(world_position, normal, base.rgb, metallic, roughness);
+    vec3 color = emission + shade(world_position, normal, base.rgb, metal, rough);
 #else
     vec3 color = emission + base.rgb;
 #endif
@@ -74,7 +84,7 @@ void main() {
     out_inverse_depth = stop_at_opaque && alpha >= 1.0 ? 0.0 : inverse_depth;
 #ifdef SURFACE
     // Phong exponent of the GGX lobe's width: alpha = roughness^2, n = 2 / alpha^2 - 2.
-    float width = max(roughness * roughness, 1e-2);
+    float width = max(rough * rough, 1e-2);
     out_normal = vec4(normal, max(2.0 / (width * width) - 2.0, 1.0));
     out_albedo = vec4(base.rgb, 1.0);
 #endif
