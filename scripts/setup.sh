@@ -83,7 +83,7 @@ if ! command -v ld >/dev/null && ! apt_install binutils; then
 fi
 
 # Proved by making a context, not by looking for files. Mesa's driver may be quite talkative while it fails.
-have_gl() { "$venv/bin/python" -c 'from cldof.capture.gl_context import probe; probe()' 2>"$venv/gl-probe.log"; }
+have_gl() { "$venv/bin/python" -c 'from cldof.capture.peel import DepthPeeler; DepthPeeler(8, 8).close()' 2>"$venv/gl-probe.log"; }
 
 if [ ! -e "$gl_stamp" ]; then
     if have_gl || { apt_install libegl1 libgl1 libgl1-mesa-dri && have_gl; }; then
