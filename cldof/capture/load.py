@@ -1,4 +1,4 @@
-"""Model files to scenes: geometry and textures through trimesh, what trimesh drops or rounds from the glTF JSON itself."""
+"""Model files to scenes: geometry and images through trimesh, what it drops or rounds from the glTF JSON itself."""
 
 from __future__ import annotations
 
@@ -40,7 +40,15 @@ _STUDIO_AMBIENT = Ambient(sky=(0.25, 0.26, 0.28), ground=(0.08, 0.075, 0.07))
 _FILE_LIGHT_SUM = 1.2
 
 
-def load_scene(path: str | Path, *, unlit: bool = False, up: str | None = None, background: Any = "studio") -> Scene:
+def load_scene(
+    path: str | Path,
+    *,
+    unlit: bool = False,
+    up: str | None = None,
+    azimuth_deg: float = 30.0,
+    elevation_deg: float = 14.0,
+    background: Any = "studio",
+) -> Scene:
     """Read a model file: glTF (.glb, .gltf), .obj, .ply, .stl, .off or anything else that trimesh reads.
 
     Cameras, lights, unlit and emissive materials of glTF are kept. What a file lacks is supplied: normals, a
@@ -54,6 +62,8 @@ def load_scene(path: str | Path, *, unlit: bool = False, up: str | None = None, 
     up : {"x", "y", "z", "-x", "-y", "-z"}, optional
         The file's up axis, which is turned to y. By default y for glTF and z for .stl and .3mf; for the others it
         points away from the model's one flat base, and is y when there is none.
+    azimuth_deg, elevation_deg : float
+        From where to look when the file has no camera: turned from +z towards +x, raised towards +y.
     background : "studio", None, RGB or Gradient
         None is a transparent void.
 
@@ -101,7 +111,7 @@ def load_scene(path: str | Path, *, unlit: bool = False, up: str | None = None, 
         turn = trimesh.geometry.align_vectors(_UP_AXES[up], _UP_AXES["y"])
         nodes = [Node(node.mesh, turn @ node.transform, node.material) for node in nodes]
     bare = Scene(path.stem, tuple(nodes))
-    camera = _gltf_camera(document, bare) or frame_camera(bare)
+    camera = _gltf_camera(document, bare) or frame_camera(bare, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
     lights = _gltf_lights(document, bare.bounds.mean(axis=0))
     return Scene(
         path.stem,

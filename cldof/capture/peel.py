@@ -6,9 +6,10 @@ deeper than the layer before. Here the test is relative and on inverse depth (sh
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,9 +20,13 @@ from ..lens import Lens
 from .gl_context import GLContext
 from .scene import Scene
 
-__all__ = ["DepthPeeler"]
+if TYPE_CHECKING:
+    from .draw import PassOptions, Target, View
+
+__all__ = ["DepthPeeler", "Progress"]
 
 Progress = Callable[[int, int], None]
+"""Called with (steps done, steps in all)."""
 
 
 class DepthPeeler:
@@ -48,7 +53,7 @@ class DepthPeeler:
 
     def __init__(self, width: int = 512, height: int = 512) -> None:
         self._size = (width, height)
-        self._targets: list[Any] = []
+        self._targets: list[Target] = []
         self._target_kind: tuple[int, int, bool] | None = None
         self._context = GLContext()
         try:
@@ -142,10 +147,16 @@ class DepthPeeler:
             buffers = {"normal": normal[..., :3], "albedo": albedo[..., :3], "shininess": normal[..., 3]}
         return LayeredFrame(color[:count], depth[:count], camera, guard_px=guard_px, **buffers)
 
-    def passes(self, scene: Scene, view: Any, layers: int, options: Any) -> Any:
+    @contextmanager
+    def current(self) -> Iterator[None]:
+        """Hold the OpenGL context, as :meth:`passes` needs it."""
+        with self._context.current():
+            yield
+
+    def passes(self, scene: Scene, view: View, layers: int, options: PassOptions) -> Iterator[Target]:
         """Draw layer after layer, front to back, and yield each target until nothing is left.
 
-        For the capture package itself. The context must be current; a target is overwritten two passes later.
+        For :mod:`cldof.capture` itself, inside :meth:`current`. A target is overwritten two passes later.
         """
         if not self._context.is_open:
             raise CaptureError("This DepthPeeler is closed; make a new one.")
@@ -159,7 +170,7 @@ class DepthPeeler:
             yield target
             previous = target
 
-    def _targets_for(self, width: int, height: int, surface: bool) -> list[Any]:
+    def _targets_for(self, width: int, height: int, surface: bool) -> list[Target]:
         from .draw import Target, opengl_errors
 
         wanted = (width, height, surface)
