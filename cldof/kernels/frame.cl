@@ -1,0 +1,23 @@
+/* frame.cl: what every method derives from a frame's layers once, before any lens is known. */
+
+#include "common.clh"
+
+/* frame_inverse_depth: 1/z of every slot, in rows padded to a pitch.
+ * source  DESIGN section 2: the CoC is linear in inverse depth, and 0 stands for infinity without being an inf
+ * reads   depth  float[peels][height][width]      m, inf = sky or nothing there
+ *         color  float[peels][height][width][4]   alpha tells sky from nothing; read where depth is inf only
+ * writes  inv_depth  float[peels][height][pitch]  1/m, 0 = sky; `nothing` where nothing is there; EMPTY past the row
+ * range   2-D, one item per row of a peel: (peels * height, 1), any local size */
+__kernel void frame_inverse_depth(__global float *restrict inv_depth, const __global float *restrict depth,
+                                  const __global float *restrict color, int width, int pitch, float nothing)
+{
+    const size_t row = get_global_id(0);
+    const __global float *z = depth + row * width;
+    const __global float *rgba = color + row * width * 4;
+    __global float *w = inv_depth + row * pitch;
+    for (int x = 0; x < width; x++) {
+        float inverse = 1.0f / z[x]; /* 0 for inf */
+        w[x] = inverse > 0.0f || rgba[4 * x + 3] > 0.0f ? inverse : nothing;
+    }
+    for (int x = width; x < pitch; x++) w[x] = EMPTY;
+}

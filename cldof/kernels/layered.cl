@@ -1,0 +1,357 @@
+/* layered.cl: depth of field from peeled layers (Schedl & Wimmer 2012).
+ *
+ * The peels are split into depth layers by matting functions and composed from both ends towards the layer in focus,
+ * blurring after each layer (their eq. 13), so that a layer is blurred by all steps between it and the focus.
+ *
+ * Inner images are float[height][pitch][4], pitch a multiple of 16 pixels. Channel 3 is *coverage*: how much of the
+ * pixel the layers so far account for. Where a frame lets the void behind the scene through, the void is given as an
+ * opaque black surface at infinity, so that coverage tells a seam between layers (divide it out, section 3.3.1) from a
+ * view past the scene (leave it); a second run with ALPHA_RUN composes the surfaces' alpha in place of their colour.
+ *
+ * Work goes by tiles of LAYERED_TILE x FIR_ROWS pixels. Tiles into which a layer has nothing to bring and no blur has
+ * reached yet are not computed. */
+
+#include "common.clh"
+#include "fir.clh"
+
+#define LAYERED_MAX_LAYERS 32
+#define LAYERED_TILE 64
+/* Below this coverage nothing is known about a pixel, and the result is exactly 0. */
+#define LAYERED_MIN_COVERAGE 1e-4f
+
+/* 1: the frame's image is not opaque, so slots with nothing in them are black surfaces at infinity. */
+#ifndef LAYERED_VOID
+#define LAYERED_VOID 0
+#endif
+/* 1: carry the surfaces' alpha in channel 0 in place of colour. */
+#ifndef LAYERED_ALPHA_RUN
+#define LAYERED_ALPHA_RUN 0
+#endif
+
+/* Matting functions of all layers, per layer (up scale, up offset, down scale, down offset): with w the inverse depth,
+ * clamp(w * scale + offset, 0, 1) rises over the interval before the layer and falls over the one behind it. */
+typedef struct {
+    float4 layer[LAYERED_MAX_LAYERS];
+} LayeredMatting;
+
+typedef struct {
+    int width, height, pitch, peels, tiles_x, tiles_y;
+} LayeredSize;
+
+typedef struct {
+    int layer;
+    int in_front;    /* 1: what is composed so far lies in front of this layer, 0: behind it */
+    int below;       /* 0: nothing composed so far, 1: `image`, where `reached` says so, 2: `image` everywhere */
+    int radius_in;   /* column filter still owed to `image` */
+    int taps_in;     /* and where its middle tap stands */
+    int radius_out;  /* row filter of this step */
+    int taps_out;
+    int segment;     /* pixels of a row a work-group owns, a multiple of LAYERED_TILE */
+} LayeredStep;
+
+static inline float4 clamp01(float4 v)
+{
+    v = v < 0.0f ? (float4)(0.0f) : v;
+    return v > 1.0f ? (float4)(1.0f) : v;
+}
+
+static inline float16 over(float16 front, float16 back)
+{
+    return front + (1.0f - front.s33337777bbbbffff) * back;
+}
+
+/* Weight of a slot in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), which fall at once
+ * at the layer's back end. They may fall as gently as the first where the slot before them already stands in this layer
+ * or in front of it (`before_falls` has not begun to fall): there nothing shows through that a nearer surface hides. */
+static inline float4 layered_weight(float4 w, float4 before, float4 matting, int peel)
+{
+    float4 up = clamp01(w * matting.x + matting.y);
+    float4 falling = w * matting.z + matting.w;
+    float4 down = clamp01(falling);
+    if (peel > 0) {
+        float4 before_falls = before * matting.z + matting.w;
+        down = before_falls >= 1.0f ? down : (falling >= 1.0f ? (float4)(1.0f) : (float4)(0.0f));
+    }
+    float4 weight = up * down;
+    return w < 0.0f ? (float4)(0.0f) : weight;
+}
+
+/* One layer (eq. 2) at the four pixels from x on: weighted slots, composed front to back.
+ * `peels` has a bit for each peel that brings something to this tile. */
+static inline float16 layered_quad(const __global float *color, const __global float *inv_depth, LayeredSize size,
+                                   float4 matting, uint peels, int x, int y)
+{
+    float16 layer = (float16)(0.0f);
+    const int valid = size.width - x;
+    for (int m = 0; m < size.peels; m++) {
+        if (!(peels >> m & 1u)) continue;
+        const size_t row = (size_t)m * size.height + y;
+        const __global float *inv = inv_depth + row * size.pitch + x;
+        float4 w = load_pixel(inv);
+        float4 before = m > 0 ? load_pixel(inv - (size_t)size.height * size.pitch) : w;
+        float4 weight = layered_weight(w, before, matting, m);
+        if (weight.x + weight.y + weight.z + weight.w <= 0.0f) continue;
+        const __global float *rgba = color + (row * size.width + x) * 4;
+        float16 c = valid >= 4 ? load_quad(rgba) : load_quad_part(rgba, valid);
+#if LAYERED_ALPHA_RUN
+        const float16 red = (float16)(1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0);
+        const float16 alpha = (float16)(0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1);
+        c = c.s33337777bbbbffff * red + c * alpha;
+#endif
+#if LAYERED_VOID
+        /* Nothing there has alpha 0 and counts as covered. */
+        float4 a = c.s37bf;
+        a = w == 0.0f && a == 0.0f ? (float4)(1.0f) : a;
+        c.s37bf = a;
+#endif
+        layer = over(layer, c * spread(weight));
+    }
+    return layer;
+}
+
+/* layered_classify: which peels bring something to which layer, per tile.
+ * reads   inv_depth    float[peels][height][pitch]
+ * writes  tile_peels   uint[layers][tiles_y][tiles_x]  bit m: peel m has a slot with weight in the layer
+ * range   2-D, one item per tile, any local size */
+__kernel void layered_classify(__global uint *restrict tile_peels, const __global float *restrict inv_depth,
+                               LayeredSize size, int layers, LayeredMatting matting)
+{
+    const int tx = get_global_id(0), ty = get_global_id(1);
+    if (tx >= size.tiles_x || ty >= size.tiles_y) return;
+    const int x_end = (tx + 1) * LAYERED_TILE < size.pitch ? (tx + 1) * LAYERED_TILE : size.pitch;
+    const int y_end = (ty + 1) * FIR_ROWS < size.height ? (ty + 1) * FIR_ROWS : size.height;
+    for (int k = 0; k < layers; k++) tile_peels[((size_t)k * size.tiles_y + ty) * size.tiles_x + tx] = 0;
+    for (int m = 0; m < size.peels; m++) {
+        int16 hits[LAYERED_MAX_LAYERS];
+        for (int k = 0; k < layers; k++) hits[k] = (int16)(0);
+        for (int x = tx * LAYERED_TILE; x < x_end; x += 16) {
+            /* A weight is non-zero on an interval of w, so the nearest and farthest slots of a column of the tile tell
+             * which layers it can touch. */
+            float16 nearest = (float16)(EMPTY), farthest = (float16)(MAXFLOAT);
+            for (int y = ty * FIR_ROWS; y < y_end; y++) {
+                float16 w = load_quad(inv_depth + ((size_t)m * size.height + y) * size.pitch + x);
+                nearest = w > nearest ? w : nearest;
+                w = w < 0.0f ? (float16)(MAXFLOAT) : w;
+                farthest = w < farthest ? w : farthest;
+            }
+            for (int k = 0; k < layers; k++) {
+                float4 f = matting.layer[k]; /* `up` falls and `down` rises with w: the CoC falls as w grows */
+                hits[k] |= (farthest * f.x + f.y > 0.0f) & (nearest * f.z + f.w > 0.0f) & (nearest >= 0.0f);
+            }
+        }
+        for (int k = 0; k < layers; k++) {
+            int8 h8 = hits[k].lo | hits[k].hi;
+            int4 h4 = h8.lo | h8.hi;
+            if (h4.x | h4.y | h4.z | h4.w)
+                tile_peels[((size_t)k * size.tiles_y + ty) * size.tiles_x + tx] |= 1u << m;
+        }
+    }
+}
+
+/* layered_step: one step of the cascade, (image filtered along the columns, over or under the layer) filtered along the
+ * rows. The column filter that belongs to the row filter is left to whoever reads `out`, who also owes `image` its own.
+ * source  Schedl & Wimmer 2012, eqs. 2-4 and 13
+ * reads   image       float[height][pitch][4]           blurred along the rows only, or whole with radius_in = 0
+ *         reached     int[tiles_y][tiles_x]             where image is not zero
+ *         color       float[peels][height][width][4]
+ *         inv_depth   float[peels][height][pitch]
+ *         tile_peels  uint[layers][tiles_y][tiles_x]
+ *         taps        float[]                           all FIR taps, padded
+ * writes  out         float[height][pitch][4]
+ *         reached_out int[tiles_y][tiles_x]
+ * range   2-D groups: (segments of a row, blocks of FIR_ROWS rows); local size (any, 1)
+ * local   lines  float[FIR_ROWS][segment + 2*halo][4], halo = radius_out + 4 rounded up to a multiple of 4
+ *         state  int[segment / LAYERED_TILE + 2*ceil(halo / LAYERED_TILE)]  per tile: 1 blur reached it, 2 layer does */
+__kernel void layered_step(__global float *restrict out, __global int *restrict reached_out,
+                           const __global float *restrict image, const __global int *restrict reached,
+                           const __global float *restrict color, const __global float *restrict inv_depth,
+                           const __global uint *restrict tile_peels, const __global float *restrict taps,
+                           LayeredSize size, LayeredStep step, LayeredMatting matting, __local float *restrict lines,
+                           __local int *restrict state)
+{
+    const int lid = get_local_id(0), items = get_local_size(0);
+    const int halo = (step.radius_out + 7) & ~3;
+    const int halo_tiles = (halo + LAYERED_TILE - 1) / LAYERED_TILE;
+    const int line_width = step.segment + 2 * halo;
+    const int x0 = (int)get_group_id(0) * step.segment;
+    const int ty = (int)get_group_id(1);
+    const int y0 = ty * FIR_ROWS;
+    const int segment_tiles = step.segment / LAYERED_TILE;
+    const int tile0 = x0 / LAYERED_TILE - halo_tiles; /* state[0] */
+    const float4 layer_matting = matting.layer[step.layer];
+    const __global uint *layer_peels = tile_peels + ((size_t)step.layer * size.tiles_y + ty) * size.tiles_x;
+
+    /* What can be non-zero here, before touching any pixel. */
+    for (int t = lid; t < segment_tiles + 2 * halo_tiles; t += items) {
+        int tx = tile0 + t, s = 0;
+        if (tx >= 0 && tx < size.tiles_x) {
+            s = layer_peels[tx] ? 2 : 0;
+            if (step.below == 1) {
+                int first = clamp_index(y0 - step.radius_in, size.height - 1) / FIR_ROWS;
+                int last = clamp_index(y0 + FIR_ROWS - 1 + step.radius_in, size.height - 1) / FIR_ROWS;
+                for (int r = first; r <= last; r++) s |= reached[r * size.tiles_x + tx] ? 1 : 0;
+            }
+            s |= step.below == 2 ? 1 : 0;
+        }
+        state[t] = s;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+
+    for (int b = lid; b < line_width / 4; b += items) {
+        int x = x0 - halo + 4 * b;
+        if (x < 0 || x >= size.width) continue;
+        int tx = x / LAYERED_TILE;
+        int s = state[tx - tile0];
+        __local float *line = lines + 16 * b;
+        if (s & 1) {
+            float16 acc[FIR_ROWS];
+            fir_columns(acc, image, x, y0, size.height, size.pitch, taps + step.taps_in, step.radius_in);
+#pragma unroll
+            for (int i = 0; i < FIR_ROWS; i++) store_quad_local(line + i * line_width * 4, acc[i]);
+        } else {
+            for (int i = 0; i < FIR_ROWS; i++) store_quad_local(line + i * line_width * 4, (float16)(0.0f));
+        }
+        if (s & 2) {
+            uint peels = layer_peels[tx];
+            for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
+                float16 below = load_quad_local(line + i * line_width * 4);
+                float16 layer = layered_quad(color, inv_depth, size, layer_matting, peels, x, y0 + i);
+                below = step.in_front ? over(below, layer) : over(layer, below);
+                store_quad_local(line + i * line_width * 4, below);
+            }
+        }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    fir_extend_lines(lines, line_width, x0 - halo, size.width);
+    barrier(CLK_LOCAL_MEM_FENCE);
+
+    for (int b = lid; b < step.segment / 8; b += items) {
+        int x = x0 + 8 * b;
+        if (x >= size.pitch) continue;
+        /* Tiles that this one's row filter reads; beyond the image's edges the edge tiles stand for the rest. */
+        int tile = x / LAYERED_TILE;
+        int any = 0;
+        for (int t = tile - halo_tiles; t <= tile + halo_tiles; t++) any |= state[t - tile0];
+        if (x % LAYERED_TILE == 0 && tile < size.tiles_x) reached_out[ty * size.tiles_x + tile] = any;
+        if (!any) {
+            for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
+                __global float *to = out + ((size_t)(y0 + i) * size.pitch + x) * 4;
+                store_quad(to, (float16)(0.0f));
+                store_quad(to + 16, (float16)(0.0f));
+            }
+            continue;
+        }
+        fir_store_pair(out, lines, line_width, 8 * b + halo, x, y0, size.height, size.pitch, taps + step.taps_out,
+                       step.radius_out);
+    }
+}
+
+/* Divide by coverage and store at the place the guard band leaves; see LAYERED_ALPHA_RUN for what the channels hold. */
+static inline void layered_finish_pixel(__global float *out, float4 v, LayeredSize size, int guard, int x, int y)
+{
+    int ox = x - guard, oy = y - guard;
+    int out_width = size.width - 2 * guard, out_height = size.height - 2 * guard;
+    if (ox < 0 || oy < 0 || ox >= out_width || oy >= out_height) return;
+    __global float *to = out + ((size_t)oy * out_width + ox) * 4;
+    float scale = v.w > LAYERED_MIN_COVERAGE ? 1.0f / v.w : 0.0f;
+#if LAYERED_ALPHA_RUN
+    float alpha = v.x * scale;
+    to[3] = alpha > 1.0f ? 1.0f : alpha;
+#else
+    store_pixel(to, (float4)(v.xyz * scale, scale > 0.0f ? 1.0f : 0.0f));
+#endif
+}
+
+static inline void layered_finish_quad(__global float *out, float16 v, LayeredSize size, int guard, int x, int y)
+{
+    layered_finish_pixel(out, v.s0123, size, guard, x, y);
+    layered_finish_pixel(out, v.s4567, size, guard, x + 1, y);
+    layered_finish_pixel(out, v.s89ab, size, guard, x + 2, y);
+    layered_finish_pixel(out, v.scdef, size, guard, x + 3, y);
+}
+
+typedef struct {
+    int layer;                   /* the one in focus */
+    int front, back;             /* as `below` in LayeredStep */
+    int radius_front, taps_front;
+    int radius_back, taps_back;
+    int guard;
+} LayeredResolve;
+
+static inline int layered_is_reached(const __global int *reached, int below, int tx, int ty, int radius,
+                                     LayeredSize size)
+{
+    if (below != 1) return below;
+    int first = clamp_index(ty * FIR_ROWS - radius, size.height - 1) / FIR_ROWS;
+    int last = clamp_index(ty * FIR_ROWS + FIR_ROWS - 1 + radius, size.height - 1) / FIR_ROWS;
+    int any = 0;
+    for (int r = first; r <= last; r++) any |= reached[r * size.tiles_x + tx];
+    return any;
+}
+
+/* layered_resolve: front over the layer in focus over back, divided by coverage (eq. 12, section 3.3.1).
+ * reads   front, back  float[height][pitch][4]  blurred along the rows, the column filter still owed
+ *         front_reached, back_reached  int[tiles_y][tiles_x]
+ *         color, inv_depth, tile_peels, taps  as layered_step
+ * writes  out  float[height - 2*guard][width - 2*guard][4]
+ * range   2-D, one item per tile column and block of rows, any local size */
+__kernel void layered_resolve(__global float *restrict out, const __global float *restrict front,
+                              const __global int *restrict front_reached, const __global float *restrict back,
+                              const __global int *restrict back_reached, const __global float *restrict color,
+                              const __global float *restrict inv_depth, const __global uint *restrict tile_peels,
+                              const __global float *restrict taps, LayeredSize size, LayeredResolve resolve,
+                              LayeredMatting matting)
+{
+    const int tx = get_global_id(0), ty = get_global_id(1);
+    if (tx >= size.tiles_x || ty >= size.tiles_y) return;
+    const int y0 = ty * FIR_ROWS;
+    const float4 layer_matting = matting.layer[resolve.layer];
+    const uint peels = tile_peels[((size_t)resolve.layer * size.tiles_y + ty) * size.tiles_x + tx];
+    const int has_front = layered_is_reached(front_reached, resolve.front, tx, ty, resolve.radius_front, size);
+    const int has_back = layered_is_reached(back_reached, resolve.back, tx, ty, resolve.radius_back, size);
+    const int x_end = (tx + 1) * LAYERED_TILE < size.width ? (tx + 1) * LAYERED_TILE : size.width;
+
+    for (int x = tx * LAYERED_TILE; x < x_end; x += 4) {
+        float16 f[FIR_ROWS], b[FIR_ROWS];
+        for (int i = 0; i < FIR_ROWS; i++) f[i] = b[i] = (float16)(0.0f);
+        if (has_front)
+            fir_columns(f, front, x, y0, size.height, size.pitch, taps + resolve.taps_front, resolve.radius_front);
+        if (has_back)
+            fir_columns(b, back, x, y0, size.height, size.pitch, taps + resolve.taps_back, resolve.radius_back);
+        for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
+            float16 v = b[i];
+            if (peels) v = over(layered_quad(color, inv_depth, size, layer_matting, peels, x, y0 + i), v);
+            layered_finish_quad(out, over(f[i], v), size, resolve.guard, x, y0 + i);
+        }
+    }
+}
+
+/* layered_under: put one whole blurred layer behind what is composed so far (the variant without cascade).
+ * reads   image    float[height][pitch][4]  blurred along the rows, the column filter still owed
+ *         taps     float[]
+ * updates composed float[height][pitch][4]  written afresh when `first`
+ * range   2-D, one item per quad of a row and block of FIR_ROWS rows, any local size */
+__kernel void layered_under(__global float *restrict composed, const __global float *restrict image,
+                            const __global float *restrict taps, LayeredSize size, int first, int radius, int centre)
+{
+    const int x = 4 * (int)get_global_id(0), y0 = FIR_ROWS * (int)get_global_id(1);
+    if (x >= size.width || y0 >= size.height) return;
+    float16 acc[FIR_ROWS];
+    fir_columns(acc, image, x, y0, size.height, size.pitch, taps + centre, radius);
+    for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
+        __global float *to = composed + ((size_t)(y0 + i) * size.pitch + x) * 4;
+        store_quad(to, first ? acc[i] : over(load_quad(to), acc[i]));
+    }
+}
+
+/* layered_finish: divide by coverage, crop the guard band.
+ * reads   composed  float[height][pitch][4]
+ * writes  out       float[height - 2*guard][width - 2*guard][4]
+ * range   2-D, one item per quad and row, any local size */
+__kernel void layered_finish(__global float *restrict out, const __global float *restrict composed, LayeredSize size,
+                             int guard)
+{
+    const int x = 4 * (int)get_global_id(0), y = get_global_id(1);
+    if (x >= size.width || y >= size.height) return;
+    layered_finish_quad(out, load_quad(composed + ((size_t)y * size.pitch + x) * 4), size, guard, x, y);
+}

@@ -1,0 +1,87 @@
+"""What a method is to the renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from ..frame import LayeredFrame
+from ..host.device import Traits
+from ..host.passes import FrameProgram
+from ..lens import Lens
+
+__all__ = ["FrameShape", "Method", "Plan", "row_pitch"]
+
+
+class FrameShape(NamedTuple):
+    """What of a frame shapes the passes, beside the plan."""
+
+    layers: int
+    height: int  # guard band included, like width
+    width: int
+    guard_px: int
+    is_opaque: bool
+
+    @classmethod
+    def of(cls, frame: LayeredFrame) -> FrameShape:
+        """The shape of a frame."""
+        return cls(frame.layer_count, frame.height, frame.width, frame.guard_px, frame.is_opaque)
+
+    @property
+    def pitch(self) -> int:
+        """Pixels from one row to the next in images on the device."""
+        return row_pitch(self.width)
+
+    @property
+    def output_size(self) -> tuple[int, int]:
+        """(height, width) without the guard band."""
+        return self.height - 2 * self.guard_px, self.width - 2 * self.guard_px
+
+
+def row_pitch(width: int) -> int:
+    """Row pitch in pixels: a multiple of 16, so that vectors never straddle rows, and no multiple of 256.
+
+    With a pitch of a power of two the pixels of a column share few cache sets, which costs CPUs a third in column
+    filters.
+    """
+    pitch = -(-width // 16) * 16
+    return pitch + 16 if pitch % 256 == 0 else pitch
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How one frame is going to be rendered.
+
+    Attributes
+    ----------
+    structure : hashable
+        What shapes the passes. Frames with the same structure and shape share programs, buffers and pass lists.
+    params : mapping
+        Values of the passes' :class:`~cldof.host.passes.Param` arguments.
+    summary : mapping
+        Plain numbers for reports.
+    """
+
+    structure: Hashable
+    params: Mapping[str, Any]
+    summary: Mapping[str, Any]
+
+
+class Method(Protocol):
+    """A depth-of-field method: turns lens and frame into passes, and owns no OpenCL object.
+
+    Passes may read the inputs ``color`` (float[layers][height][width][4]) and ``inv_depth``
+    (float[layers][height][pitch], see kernels/frame.cl) and write the output ``image``
+    (float[output height][output width][4]).
+    """
+
+    name: str
+
+    def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
+        """Decide what to compute, from numbers alone."""
+        ...
+
+    def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
+        """Declare the passes; depends on ``plan.structure`` only."""
+        ...

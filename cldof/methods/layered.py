@@ -1,0 +1,519 @@
+"""The layered method (Schedl & Wimmer 2012): matting, cascaded Gaussian blur, compositing from both ends.
+
+M peels are split into K depth layers by matting functions over the signed circle of confusion. From the nearest layer
+and from the farthest one, layers are composed and blurred step by step towards the layer in focus (their eq. 13): a
+layer ``n`` steps from the focus is blurred by all ``n`` steps, in total ``sigma_n^2 = step_1^2 + ... + step_n^2`` with
+``step_n = n * sigma_step`` (eqs. 14-15).
+
+Two things differ from the paper; docs/decisions.md gives the measurements.
+
+- Ramps of the matting functions are linear in the CoC, not in z, so that they may reach beyond infinity.
+- Anchors stand at the CoC of their layer, not half-way to the next (eq. 9). Over the interval behind anchor k the weight
+  in layer k falls from 1 to 0 in front of a full layer k+1, so what is seen passes from the blur of layer k to that of
+  layer k+1; it is right at both ends only if the anchors are the layers' own CoC. In particular the plane in focus stays
+  untouched. ``anchors="midpoint"`` gives the paper's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..frame import LayeredFrame
+from ..host.device import Traits
+from ..host.passes import Buffer, FrameProgram, Local, Param, Pass, Role, read, read_write, write
+from ..lens import GAUSSIAN_SIGMA, Lens
+from . import gaussian
+from .base import FrameShape, Plan
+
+__all__ = ["MAX_LAYERS", "Layered", "LayerStack", "matting_functions"]
+
+# Constants of kernels/layered.cl.
+MAX_LAYERS = 32
+_TILE = 64
+
+# A side whose largest CoC radius (px) stays below this gets no layers: the largest change is then below 1e-5 of a pixel
+# value, since a Gaussian of sigma 5e-4 px keeps all but exp(-2e6) of a pixel in place.
+_NEGLIGIBLE_COC_PX = 1e-3
+
+_SIZE = np.dtype([(name, np.int32) for name in ("width", "height", "pitch", "peels", "tiles_x", "tiles_y")])
+_STEP = np.dtype(
+    [
+        (name, np.int32)
+        for name in ("layer", "in_front", "below", "radius_in", "taps_in", "radius_out", "taps_out", "segment")
+    ]
+)
+_RESOLVE = np.dtype(
+    [
+        (name, np.int32)
+        for name in ("layer", "front", "back", "radius_front", "taps_front", "radius_back", "taps_back", "guard")
+    ]
+)
+_MATTING = np.dtype([("layer", np.float32, (MAX_LAYERS, 4))])
+
+
+class LayerStack(NamedTuple):
+    """Which depth layers there are: ``front`` in front of the focus, one in focus, ``back`` behind it."""
+
+    front: int
+    back: int
+    sigma_step: float
+
+    @property
+    def count(self) -> int:
+        """K."""
+        return self.front + 1 + self.back
+
+    def step_sigma(self, layer: int) -> float:
+        """Sigma in px of the blur after composing a layer (eq. 14)."""
+        return self.sigma_step * abs(layer - self.front)
+
+
+@dataclass(frozen=True)
+class _Blocking:
+    """How the FIR kernels cut an image into work-groups."""
+
+    rows: int  # FIR_ROWS
+    group: int  # FIR_GROUP
+    segment: int
+    local_size: int
+    largest_fir_sigma: float  # above it the recursive engine is faster
+
+    @property
+    def defines(self) -> tuple[tuple[str, int], ...]:
+        return (("FIR_ROWS", self.rows), ("FIR_GROUP", self.group))
+
+    def lines_bytes(self, radius: int) -> int:
+        return self.rows * (self.segment + 2 * _halo(radius)) * 16
+
+
+# On a CPU one work-item owns a block of lines that stays in its L1/L2 cache. The values for GPUs are reasoned, not
+# measured: enough items per group to hide latency, accumulators that fit the registers.
+_CPU_BLOCKING = _Blocking(rows=8, group=4, segment=512, local_size=1, largest_fir_sigma=5.5)
+_GPU_BLOCKING = _Blocking(rows=4, group=2, segment=256, local_size=64, largest_fir_sigma=12.0)
+
+
+@dataclass(frozen=True)
+class Layered:
+    """Options of the layered method.
+
+    Parameters
+    ----------
+    layers : int, optional
+        The most depth layers K to use, 3 to 32. Steps grow when the CoC range asks for more. None: up to 32.
+    sigma_step : float
+        Step of the cascade in px: the blur grows by ``n * sigma_step`` at the n-th layer from the focus. Smaller steps
+        give more layers and a better match; 1 is the paper's.
+    cascade : bool
+        False blurs every layer by itself (the paper's slower variant).
+    anchors : {"layer", "midpoint"}
+        Where matting intervals begin; see the module's text.
+    engine : {"auto", "fir", "iir"}
+        Gaussian engine; "auto" takes FIR for small sigma and the recursive one above, by device.
+    """
+
+    layers: int | None = None
+    sigma_step: float = 1.0
+    cascade: bool = True
+    anchors: str = "layer"
+    engine: str = "auto"
+
+    name = "layered"
+
+    def __post_init__(self) -> None:
+        if self.layers is not None and not (isinstance(self.layers, int) and 3 <= self.layers <= MAX_LAYERS):
+            raise InputError(f"layered: layers is {self.layers!r}; it must be a whole number from 3 to {MAX_LAYERS}.")
+        if not (isinstance(self.sigma_step, int | float) and 0.1 <= self.sigma_step < math.inf):
+            raise InputError(f"layered: sigma_step is {self.sigma_step!r}; it must be a number of at least 0.1 px.")
+        for name, choices in (("anchors", ("layer", "midpoint")), ("engine", ("auto", "fir", "iir"))):
+            if getattr(self, name) not in choices:
+                raise InputError(f"layered: {name} is {getattr(self, name)!r}; choose one of {', '.join(choices)}.")
+
+    def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
+        """Choose K, the focus layer and the step from the CoC range; derive the matting functions."""
+        c1, c0 = lens.coc_coefficients(frame.camera)
+        farthest, nearest = frame.inverse_depth_range
+        if not frame.is_opaque:
+            farthest = 0.0  # the void is a surface at infinity
+        near_px, far_px = max(0.0, -(c1 * nearest + c0)), max(0.0, c1 * farthest + c0)
+        stack = self._stack(near_px, far_px)
+        coc = layer_coc(stack, self.anchors)
+        params = np.zeros((), _MATTING)
+        params["layer"][: stack.count] = matting_functions(coc, stack.front, c1, c0, self.anchors)
+        summary = {
+            "method": self.name,
+            **{field.name: getattr(self, field.name) for field in fields(self)},
+            "layers": stack.count,
+            "focus_layer": stack.front,
+            "sigma_step": stack.sigma_step,
+            "largest_near_coc_px": near_px,
+            "largest_far_coc_px": far_px,
+        }
+        return Plan(stack, {"matting": params[()]}, summary)
+
+    def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
+        """Declare the frame's passes."""
+        stack = plan.structure
+        assert isinstance(stack, LayerStack)
+        return _Builder(self, shape, stack, traits).build()
+
+    def _stack(self, near_px: float, far_px: float) -> LayerStack:
+        """The fewest layers that reach both ends of the CoC range, with the step enlarged until they are few enough."""
+        most = self.layers or MAX_LAYERS
+        # A grid of steps, so that a lens in motion keeps to few pass lists.
+        exponent = 0
+        while True:
+            step = self.sigma_step * 2.0 ** (exponent / 8)
+            front, back = (_layers_needed(px, step, self.anchors) for px in (near_px, far_px))
+            if front + 1 + back <= most:
+                return LayerStack(front, back, step)
+            exponent += 1
+
+
+def _layers_needed(largest_coc_px: float, step: float, anchors: str) -> int:
+    if largest_coc_px < _NEGLIGIBLE_COC_PX:
+        return 0
+    count = 1
+    while count < MAX_LAYERS and _side_coc(count, step)[-1 if anchors == "layer" else -2] < largest_coc_px:
+        count += 1
+    return count
+
+
+@lru_cache(maxsize=256)
+def _side_coc(count: int, step: float) -> tuple[float, ...]:
+    """CoC radii in px of the layers 0 (focus) to ``count`` on one side: what the filters really add up to."""
+    variances = [0.0] + [_variance(n * step) for n in range(1, count + 1)]
+    return tuple(math.sqrt(total) / GAUSSIAN_SIGMA for total in np.cumsum(variances).tolist())
+
+
+def _variance(sigma: float) -> float:
+    """Variance that a step adds. Cut off and sampled taps have less than sigma^2, and the layers' CoC follow that."""
+    return gaussian.fir_variance(gaussian.fir_taps(sigma))
+
+
+def layer_coc(stack: LayerStack, anchors: str = "layer") -> NDArray[np.float64]:
+    """Signed CoC radius in px of each layer, (K,), rising; 0 for the layer in focus."""
+    front = [-c for c in _side_coc(stack.front, stack.sigma_step)[:0:-1]]
+    return np.array([*front, *_side_coc(stack.back, stack.sigma_step)])
+
+
+def matting_functions(
+    coc: NDArray[np.float64], focus: int, c1: float, c0: float, anchors: str = "layer"
+) -> NDArray[np.float64]:
+    """Matting functions as kernels/layered.cl takes them (Schedl & Wimmer 2012, eqs. 3-4).
+
+    Parameters
+    ----------
+    coc : ndarray, (K,)
+        Signed CoC radius of each layer in px, rising.
+    focus : int
+        Index of the layer in focus.
+    c1, c0 : float
+        The lens: ``C = c1 / z + c0``.
+    anchors : {"layer", "midpoint"}
+
+    Returns
+    -------
+    ndarray, (K, 4)
+        ``(up scale, up offset, down scale, down offset)`` in inverse depth. The first layer has no rise and the last no
+        fall: they take all that is nearer and farther.
+    """
+    count = len(coc)
+    if count == 1:
+        return np.array([(0.0, 1.0, 0.0, 1.0)])
+    # anchor[k + 2] is z_k as a CoC, for k = -2 .. K; beyond the layers they go on at the same distance.
+    before, after = coc[0] - (coc[1] - coc[0]), coc[-1] + (coc[-1] - coc[-2])
+    line = np.array([2 * before - coc[0], before, *coc, after])
+    anchor = line if anchors == "layer" else (line + np.append(line[1:], 2 * after - coc[-1])) / 2.0
+    functions = np.empty((count, 4))
+    for k in range(count):
+        rise_from, rise_to, fall_from, fall_to = anchor[k : k + 4]
+        up, down = 1.0 / (rise_to - rise_from), 1.0 / (fall_to - fall_from)
+        functions[k] = (c1 * up, (c0 - rise_from) * up, -c1 * down, (fall_to - c0) * down)
+    functions[0, :2] = 0.0, 1.0
+    functions[-1, 2:] = 0.0, 1.0
+    return functions
+
+
+class _Taps:
+    """All FIR taps of a frame in one buffer."""
+
+    def __init__(self) -> None:
+        self._chunks: list[NDArray[np.float32]] = []
+        self._centres: dict[float, tuple[int, int]] = {}
+        self.centre(0.0)
+
+    def centre(self, sigma: float) -> tuple[int, int]:
+        """(radius, where the middle tap stands); sigma 0 is the identity."""
+        if sigma not in self._centres:
+            start = sum(map(len, self._chunks))
+            taps = gaussian.fir_taps(sigma) if sigma > 0.0 else np.ones(1)
+            radius = len(taps) // 2
+            self._chunks.append(gaussian.padded_taps(taps))
+            self._centres[sigma] = (radius, start + gaussian.FIR_PAD + radius)
+        return self._centres[sigma]
+
+    def data(self) -> NDArray[np.float32]:
+        return np.concatenate(self._chunks)
+
+
+class _Image(NamedTuple):
+    """A partly blurred image: where it is and which column filter it is still owed."""
+
+    name: str
+    reached: str
+    below: int  # 0 none, 1 sparse, 2 everywhere; as in kernels/layered.cl
+    sigma: float
+
+
+class _Builder:
+    """Lists the passes of one frame."""
+
+    def __init__(self, method: Layered, shape: FrameShape, stack: LayerStack, traits: Traits) -> None:
+        self.method, self.shape, self.stack = method, shape, stack
+        blocking = _CPU_BLOCKING if traits.is_cpu else _GPU_BLOCKING
+        self.local_size = min(blocking.local_size, traits.max_work_group_size)
+        self.blocking, self.local_limit = blocking, traits.local_mem_bytes
+        self.tiles_x, self.tiles_y = -(-shape.width // _TILE), -(-shape.height // blocking.rows)
+        self.size = _struct(
+            _SIZE, shape.width, shape.height, shape.pitch, shape.layers, self.tiles_x, self.tiles_y
+        )
+        self.image_bytes = shape.height * shape.pitch * 16
+        self.pixels = shape.height * shape.width
+        self.taps = _Taps()
+        self.buffers = [
+            Buffer("color", shape.layers * self.pixels * 16, Role.INPUT),
+            Buffer("inv_depth", shape.layers * shape.height * shape.pitch * 4, Role.INPUT),
+            Buffer("image", math.prod(shape.output_size) * 16, Role.OUTPUT),
+            Buffer("tile_peels", stack.count * self.tiles_x * self.tiles_y * 4),
+        ]
+        self.passes: list[Pass] = []
+        # What kernels are handed where there is no image to read yet.
+        self.nothing = _Image("taps", "tile_peels", 0, 0.0)
+        self.defines: tuple[tuple[str, int], ...] = ()
+
+    def build(self) -> FrameProgram:
+        self._set_defines(alpha_run=False)
+        self._classify()
+        self._compose("rgb")
+        if not self.shape.is_opaque:
+            self._set_defines(alpha_run=True)
+            self._compose("alpha")
+        data = self.taps.data()
+        self.buffers.append(Buffer("taps", data.nbytes, Role.CONSTANT, data))
+        return FrameProgram.of(self.buffers, self.passes)
+
+    def _set_defines(self, alpha_run: bool) -> None:
+        self.defines = (
+            *self.blocking.defines,
+            ("LAYERED_VOID", int(not self.shape.is_opaque)),
+            ("LAYERED_ALPHA_RUN", int(alpha_run)),
+        )
+        # The second run fills in the alpha of the image that the first one wrote.
+        self.image = read_write("image") if alpha_run else write("image")
+
+    def _compose(self, run: str) -> None:
+        if self.method.cascade:
+            focus = self.stack.front
+            front = self._cascade(f"{run}_front", range(focus), in_front=True)
+            back = self._cascade(f"{run}_back", range(self.stack.count - 1, focus, -1), in_front=False)
+            self._resolve(front, back)
+        else:
+            self._each_by_itself(run)
+
+    def _classify(self) -> None:
+        count = self.stack.count
+        self._add(
+            "layered_classify",
+            (write("tile_peels"), read("inv_depth"), self.size, np.int32(count), Param("matting", _MATTING)),
+            (self.tiles_x, self.tiles_y),
+            traffic_bytes=self.shape.layers * self.shape.height * self.shape.pitch * 4,
+        )
+
+    def _cascade(self, name: str, layers: range, in_front: bool) -> _Image:
+        image = self.nothing
+        for layer in layers:
+            image = self._step(f"{name}_{layer}", layer, image, in_front, self.stack.step_sigma(layer))
+        return image
+
+    def _each_by_itself(self, run: str) -> None:
+        """Blur every layer alone and put one behind the other, nearest first."""
+        composed = f"{run}_composed"
+        self._image_buffer(composed)
+        sigmas = GAUSSIAN_SIGMA * np.abs(layer_coc(self.stack))
+        for layer in range(self.stack.count):
+            image = self._step(f"{run}_layer_{layer}", layer, self.nothing, True, float(sigmas[layer]))
+            radius, centre = self.taps.centre(image.sigma)
+            self._add(
+                "layered_under",
+                (
+                    write(composed) if layer == 0 else read_write(composed),
+                    read(image.name),
+                    read("taps"),
+                    self.size,
+                    np.int32(layer == 0),
+                    np.int32(radius),
+                    np.int32(centre),
+                ),
+                (-(-self.shape.width // 4), self.tiles_y),
+                traffic_bytes=self.pixels * 16 * (2 if layer == 0 else 3),
+            )
+        self._add(
+            "layered_finish",
+            (self.image, read(composed), self.size, np.int32(self.shape.guard_px)),
+            (-(-self.shape.width // 4), self.shape.height),
+            traffic_bytes=self.pixels * 32,
+        )
+
+    def _step(self, name: str, layer: int, image: _Image, in_front: bool, sigma: float) -> _Image:
+        """Compose one layer with what there is and blur both."""
+        recursive = self._is_recursive(sigma)
+        radius_in, taps_in = self.taps.centre(image.sigma)
+        row_sigma = 0.0 if recursive else sigma
+        radius_out, taps_out = self.taps.centre(row_sigma)
+        reached = f"{name}_reached"
+        self._image_buffer(name)
+        self.buffers.append(Buffer(reached, self.tiles_x * self.tiles_y * 4))
+        blocking = self.blocking
+        segment = min(blocking.segment, -(-self.shape.width // _TILE) * _TILE)
+        step = _struct(
+            _STEP, layer, int(in_front), image.below, radius_in, taps_in, radius_out, taps_out, segment
+        )
+        halo_tiles = -(-_halo(radius_out) // _TILE)
+        groups = (-(-self.shape.pitch // segment), self.tiles_y)
+        self._add(
+            "layered_step",
+            (
+                write(name),
+                write(reached),
+                read(image.name),
+                read(image.reached),
+                read("color"),
+                read("inv_depth"),
+                read("tile_peels"),
+                read("taps"),
+                self.size,
+                step,
+                Param("matting", _MATTING),
+                Local(blocking.rows * (segment + 2 * _halo(radius_out)) * 16),
+                Local((segment // _TILE + 2 * halo_tiles) * 4),
+            ),
+            (groups[0] * self.local_size, groups[1]),
+            (self.local_size, 1),
+            traffic_bytes=self.pixels * 16 * (2 if image.below else 1),
+            flops=8 * self.pixels * (2 * radius_in + 1 + 2 * radius_out + 1),
+        )
+        if not recursive:
+            return _Image(name, reached, 1, sigma)
+        return self._recursive(name, sigma)
+
+    def _recursive(self, name: str, sigma: float) -> _Image:
+        sections = gaussian.iir_sections(sigma)
+        self.buffers.append(Buffer(f"{name}_sections", sections.nbytes, Role.CONSTANT, sections))
+        names = (name, f"{name}_rows", f"{name}_blurred")
+        extent = tuple(np.int32(n) for n in (self.shape.width, self.shape.height, self.shape.pitch))
+        for kernel, source, target, items in (
+            ("blur_iir_rows", names[0], names[1], -(-self.shape.height // 4)),
+            ("blur_iir_columns", names[1], names[2], -(-self.shape.width // 4)),
+        ):
+            self._image_buffer(target)
+            self.passes.append(
+                Pass(
+                    "blur",
+                    kernel,
+                    (write(target), read(source), read(f"{name}_sections"), *extent),
+                    (items,),
+                    (1,) if self.local_size == 1 else None,
+                    self.blocking.defines,
+                    traffic_bytes=4 * self.pixels * 16,
+                    flops=48 * 4 * self.pixels,
+                )
+            )
+        return _Image(names[2], "tile_peels", 2, 0.0)
+
+    def _resolve(self, front: _Image, back: _Image) -> None:
+        ends = [(image.below, *self.taps.centre(image.sigma)) for image in (front, back)]
+        resolve = _struct(
+            _RESOLVE,
+            self.stack.front,
+            ends[0][0],
+            ends[1][0],
+            *ends[0][1:],
+            *ends[1][1:],
+            self.shape.guard_px,
+        )
+        self._add(
+            "layered_resolve",
+            (
+                self.image,
+                read(front.name),
+                read(front.reached),
+                read(back.name),
+                read(back.reached),
+                read("color"),
+                read("inv_depth"),
+                read("tile_peels"),
+                read("taps"),
+                self.size,
+                resolve,
+                Param("matting", _MATTING),
+            ),
+            (self.tiles_x, self.tiles_y),
+            traffic_bytes=self.pixels * 16 * (1 + bool(front.below) + bool(back.below)),
+        )
+
+    def _is_recursive(self, sigma: float) -> bool:
+        if sigma <= 0.0:
+            return False
+        fits = self.blocking.lines_bytes(gaussian.fir_radius(sigma)) + 256 <= self.local_limit
+        if self.method.engine == "fir" and not fits:
+            raise InputError(
+                f"layered: engine='fir' cannot blur by sigma {sigma:.1f} px on this device: its local memory of "
+                f"{self.local_limit} bytes is too small. Use engine='auto'."
+            )
+        if self.method.engine == "auto":
+            return sigma > self.blocking.largest_fir_sigma or not fits
+        return self.method.engine == "iir"
+
+    def _image_buffer(self, name: str) -> None:
+        self.buffers.append(Buffer(name, self.image_bytes))
+
+    def _add(
+        self,
+        kernel: str,
+        args: tuple[Any, ...],
+        global_size: tuple[int, ...],
+        local_size: tuple[int, ...] | None = None,
+        traffic_bytes: int = 0,
+        flops: int = 0,
+    ) -> None:
+        if local_size is None and self.local_size == 1:
+            local_size = (1,) * len(global_size)  # every new local size costs PoCL a compilation
+        self.passes.append(
+            Pass(
+                "layered",
+                kernel,
+                args,
+                global_size,
+                local_size,
+                self.defines,
+                traffic_bytes=traffic_bytes,
+                flops=flops,
+            )
+        )
+
+
+def _halo(radius: int) -> int:
+    """Pixels that a line block reaches beyond its segment; as in kernels/layered.cl."""
+    return (radius + 7) & ~3
+
+
+def _struct(dtype: np.dtype[Any], *values: int) -> np.generic:
+    scalar: np.generic = np.array(values, dtype)[()]
+    return scalar

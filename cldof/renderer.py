@@ -1,0 +1,329 @@
+"""The renderer: one device, one method; a layered frame and a lens in, an image out."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import CldofError, DeviceError, InputError
+from .frame import LayeredFrame
+from .host.buffers import HostInput
+from .host.device import Device
+from .host.passes import Buffer, FrameProgram, Pass, Role, read, write
+from .host.profile import PassTiming, pass_timings
+from .host.scheduler import Batch, FrameRing, Submission, compile
+from .lens import Lens
+from .methods import FrameShape, Plan, make_method
+
+__all__ = ["PendingResult", "Renderer", "Result"]
+
+# Pass lists kept for the most recent kinds of frame (shape and plan structure); their memory is shared through the pool.
+_KEPT_PROGRAMS = 4
+# Inverse depth of a slot with nothing in it, as kernels/common.clh has it.
+_EMPTY = -1.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """A rendered frame.
+
+    Attributes
+    ----------
+    image : ndarray, (H, W, 4), float32
+        Linear light, premultiplied alpha, guard band cropped.
+    timings : list of PassTiming
+        Per pass, in order; empty unless the renderer was made with ``profile=True``.
+    wall_ms : float
+        From the call to the image on the host.
+    plan : Plan
+        What was computed; ``plan.summary`` has it in plain numbers.
+    """
+
+    image: NDArray[np.float32]
+    timings: list[PassTiming]
+    wall_ms: float
+    plan: Plan
+
+
+@dataclass
+class _DeviceFrame:
+    """A frame's inputs on the device."""
+
+    frame: LayeredFrame  # holds the arrays, which a CPU device reads in place
+    color: HostInput
+    inv_depth: Any
+    ready: Any
+    last_use: Any = None
+
+
+class PendingResult:
+    """A frame on its way; made by :meth:`Renderer.render_async`."""
+
+    def __init__(
+        self, submission: Submission, event: Any, image: NDArray[np.float32], plan: Plan, started: float, profile: bool
+    ) -> None:
+        self._submission, self._event, self._image, self._plan = submission, event, image, plan
+        self._started, self._profile = started, profile
+        self._result: Result | None = None
+
+    def done(self) -> bool:
+        """Whether :meth:`result` would return at once."""
+        return self._result is not None or int(self._event.command_execution_status) <= 0
+
+    def result(self) -> Result:
+        """Wait for the image.
+
+        Raises
+        ------
+        DeviceError
+            The device failed on the way.
+        """
+        if self._result is None:
+            self._submission.wait()
+            self._event.wait()
+            wall_ms = (time.perf_counter() - self._started) * 1e3
+            timings = pass_timings(self._submission) if self._profile else []
+            self._result = Result(self._image, timings, wall_ms, self._plan)
+        return self._result
+
+
+class Renderer:
+    """Renders depth of field by one method on one device.
+
+    A context manager; or call :meth:`close`. Programs, buffers and pass lists are made for the first frame of a kind
+    and used again by all later ones. Calls from several threads are taken in turn.
+
+    Parameters
+    ----------
+    method : str
+        Name of the method; see :data:`cldof.methods.METHODS`.
+    device : int or str, optional
+        As :meth:`cldof.host.device.Device.open`: an index, ``"cpu"``, ``"gpu"`` or part of a name. None takes the
+        environment's ``CLDOF_DEVICE``, else a GPU, else a CPU.
+    context, queue : pyopencl.Context, pyopencl.CommandQueue, optional
+        The caller's own, in place of ``device``. They stay the caller's.
+    profile : bool
+        Time every pass. Not with ``queue``, which is profiled if it was made so.
+    out_of_order : bool
+        Use an out-of-order queue where the device has one.
+    frames_in_flight : int
+        How many frames may overlap with :meth:`render_async`; each has buffers of its own.
+    **options
+        The method's, for instance ``layers=12`` (:class:`cldof.methods.layered.Layered`).
+
+    Raises
+    ------
+    InputError
+        Unknown method or option.
+    DeviceError
+        No such device.
+    """
+
+    def __init__(
+        self,
+        method: str = "layered",
+        *,
+        device: int | str | None = None,
+        context: Any = None,
+        queue: Any = None,
+        profile: bool = False,
+        out_of_order: bool = False,
+        frames_in_flight: int = 2,
+        **options: Any,
+    ) -> None:
+        self.method = make_method(method, **options)
+        if frames_in_flight < 1:
+            raise InputError(f"frames_in_flight is {frames_in_flight}; it must be at least 1.")
+        if context is not None or queue is not None:
+            if device is not None:
+                raise InputError("Give a device, or a context or queue of your own, not both.")
+            self.device = Device.adopt(context=context, queue=queue)
+        else:
+            self.device = Device.open(device, profiling=profile, out_of_order=out_of_order)
+        self._slots = frames_in_flight
+        self._lock = threading.Lock()
+        self._rings: OrderedDict[Any, FrameRing] = OrderedDict()
+        self._preparations: OrderedDict[Any, Batch] = OrderedDict()
+        # Recent frames by identity; holding the frame keeps the identity from being used again.
+        self._frames: OrderedDict[int, _DeviceFrame] = OrderedDict()
+        self._closed = False
+
+    def render(self, frame: LayeredFrame, lens: Lens, out: NDArray[np.float32] | None = None) -> Result:
+        """Render one frame and wait for it.
+
+        Parameters
+        ----------
+        frame : LayeredFrame
+            Kept on the device while it is among the most recent ones; rendering it again with another lens does not
+            upload it again.
+        lens : Lens
+        out : ndarray, (H, W, 4), float32, C-contiguous, optional
+            Receives the image; saves an allocation per frame.
+
+        Returns
+        -------
+        Result
+
+        Raises
+        ------
+        InputError
+            ``out`` does not fit.
+        DeviceError
+            The device failed or has not enough memory.
+        """
+        return self.render_async(frame, lens, out).result()
+
+    def render_async(self, frame: LayeredFrame, lens: Lens, out: NDArray[np.float32] | None = None) -> PendingResult:
+        """Start one frame and return at once; parameters as :meth:`render`.
+
+        ``out`` must not be touched before :meth:`PendingResult.result` has returned.
+        """
+        started = time.perf_counter()
+        if not isinstance(frame, LayeredFrame) or not isinstance(lens, Lens):
+            raise InputError(f"render takes a LayeredFrame and a Lens; got {type(frame).__name__}, {type(lens).__name__}.")
+        shape = FrameShape.of(frame)
+        image = _output_array(out, (*shape.output_size, 4))
+        with self._lock:
+            if self._closed:
+                raise DeviceError("This renderer is closed; make a new one.")
+            plan = self.method.plan(frame, lens)
+            held = self._upload(frame, shape)
+            ring = self._ring(shape, plan)
+            submission = ring.submit(
+                {"color": held.color.buffer, "inv_depth": held.inv_depth}, plan.params, [*held.color.waits, held.ready]
+            )
+            held.last_use = submission.event
+            download = self.device.pool.download(submission.batch.output("image"), image, [submission.event])
+            submission.batch.hold(download)
+        return PendingResult(submission, download, image, plan, started, self.device.is_profiling)
+
+    @property
+    def peak_device_bytes(self) -> int:
+        """The most device memory held at a time; arrays that a CPU device reads in place are not counted."""
+        return self.device.pool.peak_bytes
+
+    def close(self) -> None:
+        """Wait for frames on their way and release everything. A second call does nothing."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            self.device.finish()
+            for ring in self._rings.values():
+                ring.close()
+            for batch in self._preparations.values():
+                batch.close()
+            self._rings.clear()
+            self._preparations.clear()
+            self._frames.clear()
+            self.device.close()
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        except CldofError:
+            if error is None:
+                raise
+
+    def _upload(self, frame: LayeredFrame, shape: FrameShape) -> _DeviceFrame:
+        """The frame's inputs, from the last calls or made now: colour, and inverse depth in padded rows."""
+        key = id(frame)
+        held = self._frames.get(key)
+        if held is not None:
+            self._frames.move_to_end(key)
+            return held
+        while len(self._frames) > self._slots:
+            _, old = self._frames.popitem(last=False)
+            self._free(old)
+        pool = self.device.pool
+        preparation = self._preparation(shape)
+        color, depth = pool.to_device(frame.color, "upload color"), pool.to_device(frame.depth, "upload depth")
+        submission = preparation.submit(
+            {"color": color.buffer, "depth": depth.buffer}, wait_for=[*color.waits, *depth.waits]
+        )
+        # The batch's own output would be overwritten by the next frame's.
+        inv_depth = pool.acquire(preparation.program.buffers["inv_depth"].nbytes)
+        ready = pool.copy(preparation.output("inv_depth"), inv_depth, [submission.event])
+        preparation.hold(ready)
+        pool.free_input(depth, submission.event)
+        held = self._frames[key] = _DeviceFrame(frame, color, inv_depth, ready)
+        return held
+
+    def _free(self, held: _DeviceFrame) -> None:
+        self.device.pool.free_input(held.color, held.last_use)
+        self.device.pool.release(held.inv_depth, held.last_use)
+
+    def _preparation(self, shape: FrameShape) -> Batch:
+        key = (shape.layers, shape.height, shape.width, shape.is_opaque)
+        return _cached(self._preparations, key, lambda: compile(_inverse_depth_program(shape), self.device))
+
+    def _ring(self, shape: FrameShape, plan: Plan) -> FrameRing:
+        return _cached(
+            self._rings,
+            (shape, plan.structure),
+            lambda: FrameRing(self.method.program(shape, plan, self.device.traits), self.device, self._slots),
+        )
+
+
+def _cached(cache: OrderedDict[Any, Any], key: Any, make: Any) -> Any:
+    """Look up or make, keeping the most recently used few."""
+    if key in cache:
+        cache.move_to_end(key)
+    else:
+        while len(cache) >= _KEPT_PROGRAMS:
+            cache.popitem(last=False)[1].close()
+        cache[key] = make()
+    return cache[key]
+
+
+def _inverse_depth_program(shape: FrameShape) -> FrameProgram:
+    slots = shape.layers * shape.height * shape.width
+    rows = shape.layers * shape.height
+    # Where the image is not opaque, nothing there is a surface at infinity without colour or alpha.
+    nothing = np.float32(_EMPTY if shape.is_opaque else 0.0)
+    return FrameProgram.of(
+        [
+            Buffer("color", slots * 16, Role.INPUT),
+            Buffer("depth", slots * 4, Role.INPUT),
+            Buffer("inv_depth", rows * shape.pitch * 4, Role.OUTPUT),
+        ],
+        [
+            Pass(
+                "frame",
+                "frame_inverse_depth",
+                (
+                    write("inv_depth"),
+                    read("depth"),
+                    read("color"),
+                    np.int32(shape.width),
+                    np.int32(shape.pitch),
+                    nothing,
+                ),
+                (rows,),
+                traffic_bytes=slots * 8,
+            )
+        ],
+    )
+
+
+def _output_array(out: NDArray[np.float32] | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    if out is None:
+        return np.empty(shape, np.float32)
+    if not isinstance(out, np.ndarray) or out.shape != shape or out.dtype != np.float32:
+        found = f"{out.dtype} {out.shape}" if isinstance(out, np.ndarray) else type(out).__name__
+        raise InputError(f"out is {found}; it must be a float32 array of shape {shape}.")
+    if not (out.flags.c_contiguous and out.flags.writeable):
+        raise InputError("out must be C-contiguous and writeable.")
+    return out
