@@ -195,10 +195,10 @@ def _row() -> Scene:
     haze = rgb("#d7dfe6")
     near_area, far_area = (-3.0, -7.0, 3.0, 0.0), (-40.0, -70.0, 40.0, -7.0)
     tones = ("#d9cbb8", "#b9a58c")
-    near_albedo = checker(rng, (2016, 1728), (14, 12), tones)
+    near_albedo = checker(rng, (1512, 1296), (14, 12), tones)
     # Tiles of half a metre; the far part is coarser, and wide enough for any image shape.
-    far_albedo = checker(rng, (2016, 2560), (126, 160), tones)
-    side_albedo = checker(rng, (1400, 1480), (14, 14), tones)
+    far_albedo = checker(rng, (1260, 1600), (126, 160), tones)
+    side_albedo = checker(rng, (700, 700), (14, 14), tones)
     fade = (haze, eye, 9.0, 55.0)
     nodes.append(_floor(near_albedo, near_area, light, casters, fade=fade))
     nodes.append(_floor(far_albedo, far_area, light, casters, fade=fade, softness_m=0.05))
@@ -261,10 +261,10 @@ def _fence() -> Scene:
 
     wall_z = -5.6
     palette = ["#a4523c", "#b5634a", "#8f4433", "#bd7355", "#9c5a45"]
-    wall = bricks(rng, (1500, 3400), 58, 42, palette, "#b8ab9c")
-    rows = np.linspace(1, 0, 1500, dtype=np.float32)[:, None, None]
+    wall = bricks(rng, (1300, 2200), 58, 30, palette, "#b8ab9c")
+    rows = np.linspace(1, 0, 1300, dtype=np.float32)[:, None, None]
     wall *= 0.72 + 0.28 * np.clip(rows * 6, 0, 1)  # darker where it meets the ground
-    add(quad((-5.0, 0.0, wall_z), (10.0, 0, 0), (0, 4.2, 0)), _printed(wall, 0.9), casts=False)
+    add(quad((-3.6, 0.0, wall_z), (7.2, 0, 0), (0, 4.2, 0)), _printed(wall, 0.9), casts=False)
 
     white, teal = _paint("#ece6da", 0.5), _paint("#1f6f78", 0.4)
     # A door with four panels and a brass knob.
@@ -493,13 +493,13 @@ def _chessman(kind: str) -> Any:
 
     parts = []
     if kind == "pawn":
-        parts.append(lathe([*foot, *stem, *collar, *bulb(0.2, tall + 0.2, 1.0, -0.9)]))
+        parts.append(lathe([*foot, *stem, *collar, *bulb(0.2, tall + 0.2, 1.0, -0.9)], 36))
     elif kind == "bishop":
-        parts.append(lathe([*foot, *stem, *collar, *bulb(0.19, tall + 0.26, 1.35, -0.9)]))
+        parts.append(lathe([*foot, *stem, *collar, *bulb(0.19, tall + 0.26, 1.35, -0.9)], 36))
         parts.append(moved(ball(0.05, 20), (0, tall + 0.54, 0)))
     elif kind == "rook":
         crown = [(0.2, tall + 0.06), (0.27, tall + 0.12), (0.28, tall + 0.3), (0.2, tall + 0.3), (0.19, tall + 0.2)]
-        parts.append(lathe([*foot, *stem, *collar, *crown, (0, tall + 0.2)]))
+        parts.append(lathe([*foot, *stem, *collar, *crown, (0, tall + 0.2)], 36))
         for k in range(6):
             a = k * math.pi / 3
             spot = (0.238 * math.cos(a), tall + 0.325, 0.238 * math.sin(a))
@@ -512,7 +512,7 @@ def _chessman(kind: str) -> Any:
             (0.24, tall + 0.43),
             (0.18, tall + 0.36),
         ]
-        parts.append(lathe([*foot, *stem, *collar, *crown, *bulb(0.17, tall + 0.36, 0.9, 0.1)]))
+        parts.append(lathe([*foot, *stem, *collar, *crown, *bulb(0.17, tall + 0.36, 0.9, 0.1)], 36))
         if kind == "queen":
             parts.append(moved(ball(0.06, 20), (0, tall + 0.55, 0)))
             for k in range(9):
@@ -576,7 +576,7 @@ def _tabletop() -> Scene:
         nodes.append(Node(book, material=_paint(spines[int(rng.integers(7))], 0.8)))
         x += wide
     nodes.append(Node(moved(block((3.4, 0.05, 0.34), 0.01), (0, -0.305, -3.2)), material=_paint("#4a3222", 0.6)))
-    lamp, glows = ball(0.017, 16), [_glow("#ffb057", 26.0), _glow("#ffd9a0", 34.0), _glow("#ff7a4a", 20.0)]
+    lamp, glows = ball(0.017, 16), [_glow("#ffb057", 14.0), _glow("#ffd9a0", 17.0), _glow("#ff7a4a", 11.0)]
     for string, (sag, top, depth) in enumerate(((0.16, 0.40, -2.9), (0.18, 0.26, -2.3), (0.12, 0.62, -3.2))):
         for k in range(15):
             u = (k + 0.5 * (string % 2)) / 14 - 0.5
