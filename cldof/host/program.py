@@ -10,15 +10,16 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import tempfile
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Lock
 from typing import Any, Protocol
 
-from ..errors import BuildError, InputError
+from ..errors import BuildError, InputError, OutputError
+from ..files import atomic_write
 from . import opencl as cl
-from .quirks import Effect, effects_of
+from .quirks import Effect, effects_of, user_cache_dir
 
 __all__ = ["BUILD_OPTIONS", "Defines", "ProgramCache", "SourceDirectory", "default_cache_dir", "expand", "numbered"]
 
@@ -82,8 +83,7 @@ def default_cache_dir() -> Path:
     """Where built programs are kept: ``CLDOF_CACHE_DIR``, or the user's cache directory."""
     if chosen := os.environ.get("CLDOF_CACHE_DIR"):
         return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(base) if base else Path.home() / ".cache") / "cldof"
+    return user_cache_dir() / "cldof"
 
 
 class ProgramCache:
@@ -207,16 +207,10 @@ class _DiskCache:
         return binary if hashlib.sha256(binary).digest() == checksum else None
 
     def store(self, key: str, binary: bytes) -> None:
-        temporary = None
-        try:
+        with suppress(OSError, OutputError):
             self._directory.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=self._directory, delete=False) as file:
-                temporary = Path(file.name)
+            with atomic_write(self._directory / key) as file:
                 file.write(hashlib.sha256(binary).digest() + binary)
-            temporary.replace(self._directory / key)  # atomic: other processes see all of it or nothing
-        except OSError:
-            if temporary:
-                temporary.unlink(missing_ok=True)
 
 
 def _expanded(name: str, directory: SourceDirectory, above: tuple[str, ...]) -> Iterable[str]:

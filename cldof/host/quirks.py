@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-__all__ = ["QUIRKS", "Effect", "Quirk", "effects_of", "prepare_environment"]
+__all__ = ["QUIRKS", "Effect", "Quirk", "effects_of", "prepare_environment", "user_cache_dir"]
 
 
 class Effect(Enum):
@@ -102,14 +102,20 @@ def prepare_environment() -> None:
     or fails every build. Only a directory that cannot work is replaced, and only where the user set nothing that works.
     """
     chosen = os.environ.get("POCL_CACHE_DIR")
-    if chosen is None:
-        base = os.environ.get("XDG_CACHE_HOME")
-        directory = Path(base) if base else Path.home() / ".cache"
-    else:
-        directory = Path(chosen)
+    directory = user_cache_dir() if chosen is None else Path(chosen)
     if not _can_hold_files(directory):
         owner = os.getuid() if hasattr(os, "getuid") else "user"
         os.environ["POCL_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"cldof-pocl-{owner}")
+
+
+def user_cache_dir() -> Path:
+    """Where programs keep what they can make again; need not exist."""
+    if base := os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA"):
+        return Path(base)
+    try:
+        return Path.home() / ".cache"
+    except RuntimeError:  # a user without a home directory
+        return Path(tempfile.gettempdir())
 
 
 def _can_hold_files(directory: Path) -> bool:

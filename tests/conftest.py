@@ -1,0 +1,171 @@
+"""Devices, caches and hypothesis settings for every test.
+
+``device`` runs a test once per OpenCL device of the machine, ``out_of_order_device`` the same on queues that reorder.
+Their pools surround every buffer with canaries, fill it with NaN, and are checked after every test: a kernel that
+writes outside its buffers, or counts on zeros, fails here without any effort in the test.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import hypothesis
+import numpy as np
+import pytest
+
+from cldof.errors import DeviceError
+from cldof.host import opencl as cl
+from cldof.host.buffers import BufferPool
+from cldof.host.device import Device, DeviceInfo, list_devices
+
+hypothesis.settings.register_profile("cldof", deadline=None, derandomize="CI" in os.environ)
+hypothesis.settings.load_profile("cldof")
+
+CANARY = 0xA5
+UNWRITTEN = 0xFF  # NaN as float32, -1 as int32
+
+
+def _claim_pocl_cache() -> IO[str] | None:
+    """Point PoCL to a cache directory that no other running process uses, and that later runs find again.
+
+    PoCL's cache may crash when processes share it. Directories are numbered; a lock that ends with this process marks
+    the ones in use.
+    """
+    try:
+        import fcntl
+    except ImportError:  # not a POSIX system
+        os.environ["POCL_CACHE_DIR"] = tempfile.mkdtemp(prefix="cldof-pocl-")
+        return None
+    root = Path(os.environ.get("POCL_CACHE_DIR") or Path.home() / ".cache" / "cldof-tests")
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        for number in range(256):
+            lock = open(root / f"pocl-{number}.lock", "w")  # noqa: SIM115 - held until the process ends
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                lock.close()
+                continue
+            (root / f"pocl-{number}").mkdir(exist_ok=True)
+            os.environ["POCL_CACHE_DIR"] = str(root / f"pocl-{number}")
+            return lock
+    except OSError:  # a read-only home directory
+        pass
+    os.environ["POCL_CACHE_DIR"] = tempfile.mkdtemp(prefix="cldof-pocl-")
+    return None
+
+
+# Before anything imports pyopencl.
+_pocl_cache_lock = _claim_pocl_cache()
+
+
+def _find_devices() -> tuple[list[DeviceInfo], str]:
+    try:
+        return list_devices(), "this machine has no OpenCL device"
+    except DeviceError as error:
+        return [], str(error)
+
+
+_DEVICES, _WHY_NONE = _find_devices()
+_PARAMS = [pytest.param(info, id=f"{info.index}-{info.name.split('-')[0].replace(' ', '_')}") for info in _DEVICES]
+
+
+class CanaryPool(BufferPool):
+    """A pool whose buffers have the size asked for to the byte, canaries on both sides, and NaN inside."""
+
+    def __init__(self, context: Any, queue: Any, *, shares_memory: bool) -> None:
+        super().__init__(context, queue, shares_memory=shares_memory)
+        self._margin = max(queue.device.mem_base_addr_align // 8, 512)
+        self._parents: dict[int, tuple[Any, Any, int]] = {}
+
+    def acquire(self, nbytes: int) -> Any:
+        """Never reused, so that every acquired buffer is all NaN."""
+        if nbytes <= 0 or nbytes + 2 * self._margin > self._queue.device.max_mem_alloc_size:
+            return super().acquire(nbytes)
+        contents = np.full(nbytes + 2 * self._margin, CANARY, np.uint8)
+        contents[self._margin : -self._margin] = UNWRITTEN
+        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+        parent = cl.Buffer(self._context, flags, hostbuf=contents)
+        buffer = parent.get_sub_region(self._margin, nbytes)
+        self._parents[buffer.int_ptr] = (parent, buffer, nbytes)
+        self._in_use[buffer.int_ptr] = buffer
+        self.in_use_bytes += nbytes
+        self.allocated_bytes += nbytes
+        self.peak_bytes = max(self.peak_bytes, self.allocated_bytes)
+        return buffer
+
+    def trampled(self) -> list[str]:
+        """What was written outside its buffer; forgets buffers that are no longer in use."""
+        self._queue.finish()
+        found = []
+        for address, (parent, _, nbytes) in list(self._parents.items()):
+            contents = np.empty(nbytes + 2 * self._margin, np.uint8)
+            cl.enqueue_copy(self._queue, contents, parent)
+            margins = (("before", contents[: self._margin]), ("after", contents[-self._margin :]))
+            for side, margin in margins:
+                wrong = np.flatnonzero(margin != CANARY)
+                if wrong.size:
+                    found.append(f"{wrong.size} bytes written {side} a buffer of {nbytes}, first at {wrong[0]}")
+            if address not in self._in_use:
+                del self._parents[address]
+        self.trim()
+        return found
+
+
+class DeviceOpener:
+    """Opens devices with canaries and closes them at the end of the session."""
+
+    def __init__(self) -> None:
+        self.opened: list[Device] = []
+
+    def __call__(self, info: DeviceInfo, **options: Any) -> Device:
+        """Like ``Device.open(info.index, ...)``, with pass signatures checked."""
+        device = Device.open(info.index, check_signatures=True, **options)
+        self.opened.append(device)
+        device.pool = CanaryPool(device.context, device.queue, shares_memory=device.pool.shares_memory)
+        return device
+
+
+@pytest.fixture(scope="session")
+def open_device() -> Iterator[DeviceOpener]:
+    """Open further devices: ``open_device(device.info, profiling=True)``; closed when the session ends."""
+    opener = DeviceOpener()
+    yield opener
+    for device in opener.opened:
+        device.close()
+
+
+@pytest.fixture(autouse=True)
+def _canaries(open_device: DeviceOpener) -> Iterator[None]:
+    yield
+    found = [what for device in open_device.opened for what in device.pool.trampled()]  # type: ignore[attr-defined]
+    assert not found, f"a kernel wrote outside its buffers: {found}"
+
+
+@pytest.fixture(scope="session", params=_PARAMS or [pytest.param(None, id="no-device")])
+def device_info(request: pytest.FixtureRequest) -> DeviceInfo:
+    """Every OpenCL device of this machine in turn."""
+    if request.param is None:
+        if os.environ.get("CLDOF_REQUIRE_DEVICE") == "1":
+            pytest.fail(f"CLDOF_REQUIRE_DEVICE=1, but {_WHY_NONE}")
+        pytest.skip(_WHY_NONE)
+    return request.param  # type: ignore[no-any-return]
+
+
+@pytest.fixture(scope="session")
+def device(device_info: DeviceInfo, open_device: Callable[..., Device]) -> Device:
+    """A device with an in-order queue."""
+    return open_device(device_info)
+
+
+@pytest.fixture(scope="session")
+def out_of_order_device(device_info: DeviceInfo, open_device: Callable[..., Device]) -> Device:
+    """A device with an out-of-order queue."""
+    device = open_device(device_info, out_of_order=True)
+    if not device.is_out_of_order:
+        pytest.skip(f"{device_info.name} has no out-of-order queues")
+    return device
