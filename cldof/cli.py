@@ -209,14 +209,14 @@ def _render(arguments: argparse.Namespace) -> None:
             details = {
                 **facts,
                 "output": str(output),
-                "plan": _plain(result.plan),
+                "plan": _plain(result.plan.summary),
                 "timings": {"steps_s": watch.seconds, "passes_ms": passes},
                 "versions": _versions(),
             }
             with atomic_write(report) as stream:
                 stream.write(json.dumps(details, indent=2, allow_nan=False).encode() + b"\n")
     if not arguments.quiet:
-        _summarise(output, facts, shot, watch, sum(item["ms"] for item in passes))
+        _summarise(output, facts, shot, watch, sum(timing.ms for timing in result.timings))
 
 
 class _Shot(NamedTuple):

@@ -66,7 +66,7 @@ class LayeredFrame:
     ) -> None:
         if not isinstance(camera, Camera):
             raise FrameError(f"LayeredFrame needs a cldof.Camera; got {type(camera).__name__}.")
-        if isinstance(guard_px, bool) or guard_px != int(guard_px) or guard_px < 0:
+        if isinstance(guard_px, bool) or not isinstance(guard_px, int | np.integer) or guard_px < 0:
             raise FrameError(f"guard_px is {guard_px!r}; it must be a whole number of pixels, at least 0.")
         self.camera = camera
         self.guard_px = int(guard_px)
@@ -193,7 +193,8 @@ class LayeredFrame:
         try:
             if not os.path.isfile(path):
                 raise FrameError(f"Cannot read frame {path}: no such file.")
-            with np.load(path, allow_pickle=False) as data:
+            # Opened here: numpy leaves the file open when it turns out not to be a zip archive.
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as data:
                 header = json.loads(bytes(data["header"]).decode())
                 arrays = {name: data[name] for name in ("color", "depth", *_SURFACE_CHANNELS) if name in data}
             if header["version"] != _FORMAT_VERSION:

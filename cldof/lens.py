@@ -206,5 +206,5 @@ def lens_samples(count: int, shape: str = "disc", seed: int = 0) -> NDArray[np.f
     else:
         raise InputError(f"Lens shape {shape!r} is unknown; use 'disc' or 'gaussian'.")
     angle = index * math.pi * (3.0 - math.sqrt(5.0)) + 2.0 * math.pi * np.random.default_rng(seed).random()
-    points: NDArray[np.float64] = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    return points - points.mean(axis=0)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    return np.asarray(points - points.mean(axis=0), dtype=np.float64)
