@@ -133,14 +133,14 @@ def test_bad_values_are_refused(what: str, index: tuple[int, ...], value: float,
 def test_all_bad_values_are_counted() -> None:
     color, depth = arrays()
     depth[:, 1:3] = math.nan
-    with pytest.raises(FrameError, match="depth has 20 NaN values.*layer 0 at pixel x=0, y=1"):
+    with pytest.raises(FrameError, match=r"depth has 20 NaN values.*layer 0 at pixel x=0, y=1"):
         LayeredFrame(color, depth, CAMERA)
 
 
 def test_layers_out_of_order_are_refused() -> None:
     color, depth = arrays()
     depth[1, 2, 1] = depth[0, 2, 1] * 0.5
-    with pytest.raises(FrameError, match="out of order.*layer 1 at pixel x=1, y=2"):
+    with pytest.raises(FrameError, match=r"out of order.*layer 1 at pixel x=1, y=2"):
         LayeredFrame(color, depth, CAMERA)
     depth[1] = depth[0]  # repeated depths are fine
     LayeredFrame(color, depth, CAMERA)
@@ -164,7 +164,7 @@ def test_wrong_shapes_are_refused(color_shape: tuple[int, ...], depth_shape: tup
 
 
 def test_integers_are_refused_with_advice() -> None:
-    with pytest.raises(FrameError, match="color has dtype uint8.*sRGB"):
+    with pytest.raises(FrameError, match=r"color has dtype uint8.*sRGB"):
         LayeredFrame(np.zeros((4, 5, 4), np.uint8), np.ones((4, 5), np.float32), CAMERA)
     with pytest.raises(FrameError, match="depth has dtype"):
         LayeredFrame(np.zeros((4, 5, 4), np.float32), np.ones((4, 5), np.int32), CAMERA)
@@ -191,7 +191,7 @@ def test_surface_buffers() -> None:
     with pytest.raises(FrameError, match="shininess has 1 layers but depth has 2"):
         LayeredFrame(color, depth, CAMERA, shininess=np.ones((4, 5), np.float32))
     normal[1, 2, 3, 1] = np.nan
-    with pytest.raises(FrameError, match="normal has 1 NaN.*layer 1 at pixel x=3, y=2"):
+    with pytest.raises(FrameError, match=r"normal has 1 NaN.*layer 1 at pixel x=3, y=2"):
         LayeredFrame(color, depth, CAMERA, normal=normal)
 
 
