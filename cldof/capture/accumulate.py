@@ -68,7 +68,7 @@ def accumulate(
     points = lens_samples(int(views), shape, seed) * lens.aperture_radius_m
     if lens.aperture_radius_m == 0.0 and not jitter:
         points = points[:1]
-    shifts = np.random.default_rng(seed).random((len(points), 2)) - 0.5 if jitter else np.zeros((len(points), 2))
+    shifts = _pixel_shifts(len(points), seed) if jitter else np.zeros((len(points), 2))
 
     from .draw import PassOptions, View
 
@@ -92,3 +92,11 @@ def accumulate(
                 progress(index + 1, len(points))
     mean: NDArray[np.float32] = (total / len(points)).astype(np.float32)
     return mean
+
+
+def _pixel_shifts(count: int, seed: int) -> NDArray[np.float64]:
+    """Points spread evenly over a pixel, in [-1/2, 1/2): Roberts' R2 sequence, unrelated to the spiral of the lens."""
+    root = 1.32471795724474602596  # of x**3 = x + 1
+    start = np.random.default_rng(seed).random(2)
+    shifts: NDArray[np.float64] = (start + np.arange(count)[:, None] / (root, root * root)) % 1.0 - 0.5
+    return shifts

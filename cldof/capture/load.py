@@ -9,6 +9,7 @@ import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..errors import SceneError
+from ..images import srgb_from_linear
 from .normals import merged_faces, with_crease_normals
 from .scene import Ambient, DirectionalLight, Gradient, Material, Node, PointLight, Scene
 
-__all__ = ["frame_camera", "load_scene", "studio_lights"]
+__all__ = ["load_scene", "studio_lights"]
 
 _GLB_MAGIC, _GLB_JSON, _GLB_HEADER = b"glTF", 0x4E4F534A, 12
 _TAG = "cldof-material-"
@@ -110,14 +112,13 @@ def load_scene(
     if up != "y":
         turn = trimesh.geometry.align_vectors(_UP_AXES[up], _UP_AXES["y"])
         nodes = [Node(node.mesh, turn @ node.transform, node.material) for node in nodes]
-    bare = Scene(path.stem, tuple(nodes))
-    camera = _gltf_camera(document, bare) or frame_camera(bare, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
+    bare = Scene(path.stem, tuple(nodes), view_from_deg=(azimuth_deg, elevation_deg))
+    camera = _gltf_camera(document, bare)
     lights = _gltf_lights(document, bare.bounds.mean(axis=0))
-    return Scene(
-        path.stem,
-        bare.nodes,
+    return replace(
+        bare,
         camera=camera,
-        lights=lights or studio_lights(camera),
+        lights=lights or studio_lights(camera or bare.camera_for(512, 512)),
         ambient=Ambient((0.12,) * 3, (0.06,) * 3) if lights else _STUDIO_AMBIENT,
         background=_STUDIO_SKY if isinstance(background, str) and background == "studio" else background,
         unlit=unlit,
@@ -139,61 +140,20 @@ def studio_lights(camera: Camera) -> tuple[DirectionalLight, ...]:
     )
 
 
-def frame_camera(
-    scene: Scene,
-    *,
-    azimuth_deg: float = 30.0,
-    elevation_deg: float = 14.0,
-    yfov_deg: float = 30.0,
-    width: int = 1024,
-    height: int = 1024,
-    fill: float = 0.84,
-) -> Camera:
-    """The nearest camera in a direction that sees all vertices within ``fill`` of the image, centred.
-
-    Azimuth turns from +z towards +x, elevation rises towards +y.
-    """
-    points = np.concatenate(
-        [
-            trimesh.transform_points(node.mesh.vertices, node.transform)
-            for node in scene.nodes
-            if len(node.mesh.vertices)
-        ]
-    )
-    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-    back = np.array(
-        [math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]
-    )
-    right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
-    rotation = np.stack([right, np.cross(back, right), back], axis=1)
-    local = points @ rotation  # camera axes, world origin
-    slope = fill * math.tan(math.radians(yfov_deg) / 2.0) * np.array([width / height, 1.0])
-    # The frustum's four planes touch the points: each pair of opposite planes gives a centre and a distance.
-    centre, distance = np.empty(2), np.empty(2)
-    for axis in range(2):
-        high = (local[:, axis] / slope[axis] + local[:, 2]).max()
-        low = (-local[:, axis] / slope[axis] + local[:, 2]).max()
-        centre[axis], distance[axis] = (high - low) * slope[axis] / 2.0, (high + low) / 2.0
-    eye_depth = float(distance.max())
-    size = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
-    eye_depth = max(eye_depth, float(local[:, 2].max()) + 1e-3 * size)
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = rotation @ (centre[0], centre[1], eye_depth)
-    return Camera(width, height, yfov_deg, near=1e-3 * max(eye_depth - float(local[:, 2].min()), size), pose=pose)
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep trimesh's log and the warnings of what it calls from the caller's terminal."""
-    logger = logging.getLogger("trimesh")
-    disabled, logger.disabled = logger.disabled, True
+    loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.split(".")[0] == "trimesh"]
+    before = [logger.disabled for logger in loggers]
+    for logger in loggers:
+        logger.disabled = True
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        logger.disabled = disabled
+        for logger, disabled in zip(loggers, before, strict=True):
+            logger.disabled = disabled
 
 
 def _tagged_gltf(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -263,9 +223,7 @@ def _mesh(
             materials[key] = _gltf_material(None if key is None else document["materials"][key], source)
         if mesh.visual.kind == "vertex":  # trimesh keeps glTF's linear colours in bytes, where a Scene has sRGB
             colors = np.asarray(mesh.visual.vertex_colors).copy()
-            linear = colors[:, :3] / 255.0
-            srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-            colors[:, :3] = np.round(srgb * 255.0)
+            colors[:, :3] = np.round(srgb_from_linear(colors[:, :3] / 255.0) * 255.0)
             mesh.visual.vertex_colors = colors
     else:
         is_open = _is_open(mesh)

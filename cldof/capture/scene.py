@@ -22,6 +22,9 @@ from ..errors import SceneError
 
 __all__ = ["Ambient", "DirectionalLight", "Gradient", "Material", "Node", "PointLight", "Scene"]
 
+# A scene without a camera is seen through this angle and fills this share of the image.
+_FRAMING_FOV_DEG, _FRAMING_FILL = 30.0, 0.84
+
 RGB = tuple[float, float, float]
 RGBA = tuple[float, float, float, float]
 
@@ -177,7 +180,7 @@ class Scene:
     name : str
     nodes : sequence of Node
     camera : Camera, optional
-        A good view; :meth:`camera_for` gives it at any image size.
+        A good view; None frames the whole scene. :meth:`camera_for` gives it at any image size.
     lights : sequence of DirectionalLight and PointLight
         At most 8 of each kind.
     ambient : Ambient
@@ -187,6 +190,8 @@ class Scene:
         Suggestions of whoever made the scene.
     unlit : bool
         Show all materials unlit.
+    view_from_deg : (azimuth, elevation)
+        Where a scene without a camera is seen from: turned from +z towards +x, raised towards +y.
     """
 
     name: str
@@ -198,6 +203,7 @@ class Scene:
     focus_distance_m: float | None = None
     aperture_radius_m: float | None = None
     unlit: bool = False
+    view_from_deg: tuple[float, float] = (30.0, 14.0)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", tuple(self.nodes))
@@ -235,7 +241,7 @@ class Scene:
         return any(node.material.alpha_mode == "blend" for node in self.nodes)
 
     def camera_for(self, width: int, height: int) -> Camera:
-        """The scene's camera at another image size.
+        """The scene's camera at another image size, or one that frames the scene if it has none.
 
         The vertical field of view stays; in an image narrower than the camera's own, the horizontal one stays instead,
         so that what was framed is still seen.
@@ -243,13 +249,36 @@ class Scene:
         Raises
         ------
         SceneError
-            If the scene has no camera.
+            If the scene has neither a camera nor vertices.
         """
         if self.camera is None:
-            raise SceneError(f"Scene {self.name!r} has no camera; give one.")
+            return self._framing_camera(width, height)
         camera = replace(self.camera, width=width, height=height)
-        narrowing = (self.camera.width / self.camera.height) / (width / height)
+        narrowing = (self.camera.width / self.camera.height) / (camera.width / camera.height)
         if narrowing <= 1.0:
             return camera
         half = math.tan(math.radians(self.camera.yfov_deg) / 2.0)
         return replace(camera, yfov_deg=math.degrees(2.0 * math.atan(half * narrowing)))
+
+    def _framing_camera(self, width: int, height: int) -> Camera:
+        """The nearest camera in direction ``view_from_deg`` that sees all vertices, centred, with a margin."""
+        size = float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
+        azimuth, elevation = (math.radians(angle) for angle in self.view_from_deg)
+        level = math.cos(elevation)
+        back = np.array([math.sin(azimuth) * level, math.sin(elevation), math.cos(azimuth) * level])
+        right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
+        rotation = np.stack([right, np.cross(back, right), back], axis=1)
+        # A narrow image gets the angle across its width, not its height.
+        half = math.tan(math.radians(_FRAMING_FOV_DEG) / 2.0) * max(1.0, height / width)
+        camera = Camera(width, height, math.degrees(2.0 * math.atan(half)))
+        slope = _FRAMING_FILL * half * np.array([width / height, 1.0])
+        # The four planes of the frustum touch the vertices: two opposite planes give a centre and a distance.
+        local = np.concatenate([trimesh.transform_points(n.mesh.vertices, n.transform) for n in self.nodes]) @ rotation
+        high = (local[:, :2] / slope + local[:, 2:]).max(axis=0)
+        low = (-local[:, :2] / slope + local[:, 2:]).max(axis=0)
+        centre = (high - low) * slope / 2.0
+        distance = max(float((high + low).max()) / 2.0, float(local[:, 2].max()) + 1e-3 * size)
+        pose = np.eye(4)
+        pose[:3, :3] = rotation
+        pose[:3, 3] = rotation @ (centre[0], centre[1], distance)
+        return replace(camera, near=1e-3 * max(size, distance - float(local[:, 2].min()), 1e-9), pose=pose)

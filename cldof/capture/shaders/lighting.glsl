@@ -60,7 +60,7 @@ vec3 shade(vec3 position, vec3 n, vec3 base, float metal, float rough) {
         float n_h = max(dot(n, h), 0.0);
         float d = n_h * n_h * (alpha2 - 1.0) + 1.0;
         float masking = (n_l * (1.0 - k) + k) * (n_v * (1.0 - k) + k);
-        vec3 fresnel = f0 + (1.0 - f0) * pow(1.0 - max(dot(v, h), 0.0), 5.0);
+        vec3 fresnel = f0 + (1.0 - f0) * pow(1.0 - clamp(dot(v, h), 0.0, 1.0), 5.0);
         vec3 specular = fresnel * (alpha2 / (4.0 * d * d * masking));  // times pi, as the lights are
         total += (diffuse * (1.0 - fresnel) + specular) * light * n_l;
     }
