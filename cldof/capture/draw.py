@@ -93,7 +93,7 @@ class PassOptions:
     """What a pass does beyond drawing.
 
     ``lens_reach_m``: back faces of single-sided materials are dropped unless a lens point within this radius sees their
-    front; None keeps them all. ``stop_at_opaque``: nothing is peeled behind an opaque fragment. ``surface``: write
+    front; 0 drops all that this view sees from behind, None keeps them all. ``stop_at_opaque``: nothing is peeled behind an opaque fragment. ``surface``: write
     normals and albedo too.
     """
 
@@ -364,7 +364,7 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
                 program = self._program("surface", {**item.defines, **surface}, prepared, common)
                 program.set(item.uniforms)
                 program.set({"model_view": to_camera @ item.transform})
-                self._draw_item(item)
+                self._draw_item(item, cull=options.lens_reach_m == 0.0 and "DOUBLE_SIDED" not in item.defines)
             if scene.background is not None:
                 sky = scene.background
                 top, bottom = (sky.top, sky.bottom) if isinstance(sky, Gradient) else (sky, sky)
@@ -399,12 +399,13 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
             prepared.add(program)
         return program
 
-    def _draw_item(self, item: _Item) -> None:
+    def _draw_item(self, item: _Item, cull: bool) -> None:
         for unit, texture in item.textures.items():
             gl.glActiveTexture(gl.GL_TEXTURE0 + unit)
             texture._bind()
         # The window is upside down (see View), which turns every triangle round; a mirroring transform turns it back.
         gl.glFrontFace(gl.GL_CCW if item.mirrored else gl.GL_CW)
+        (gl.glEnable if cull else gl.glDisable)(gl.GL_CULL_FACE)
         primitive = item.primitive
         primitive._bind()
         gl.glDrawElements(gl.GL_TRIANGLES, primitive.indices.size, gl.GL_UNSIGNED_INT, None)
