@@ -57,10 +57,11 @@ class _DeviceFrame:
     """A frame's inputs on the device."""
 
     frame: LayeredFrame  # holds the arrays, which a CPU device reads in place
+    shape: FrameShape
     color: HostInput
-    inv_depth: Any
-    ready: Any
-    last_use: Any = None
+    preparation: Batch  # made inv_depth, and owns it
+    ready: Any  # event
+    last_use: Any = None  # event
 
 
 class PendingResult:
@@ -150,7 +151,6 @@ class Renderer:
         self._slots = frames_in_flight
         self._lock = threading.Lock()
         self._rings: OrderedDict[Any, FrameRing] = OrderedDict()
-        self._preparations: OrderedDict[Any, Batch] = OrderedDict()
         # Recent frames by identity; holding the frame keeps the identity from being used again.
         self._frames: OrderedDict[int, _DeviceFrame] = OrderedDict()
         self._closed = False
@@ -187,7 +187,9 @@ class Renderer:
         """
         started = time.perf_counter()
         if not isinstance(frame, LayeredFrame) or not isinstance(lens, Lens):
-            raise InputError(f"render takes a LayeredFrame and a Lens; got {type(frame).__name__}, {type(lens).__name__}.")
+            raise InputError(
+                f"render takes a LayeredFrame and a Lens; got {type(frame).__name__}, {type(lens).__name__}."
+            )
         shape = FrameShape.of(frame)
         image = _output_array(out, (*shape.output_size, 4))
         with self._lock:
@@ -197,7 +199,9 @@ class Renderer:
             held = self._upload(frame, shape)
             ring = self._ring(shape, plan)
             submission = ring.submit(
-                {"color": held.color.buffer, "inv_depth": held.inv_depth}, plan.params, [*held.color.waits, held.ready]
+                {"color": held.color.buffer, "inv_depth": held.preparation.output("inv_depth")},
+                plan.params,
+                [*held.color.waits, held.ready],
             )
             held.last_use = submission.event
             download = self.device.pool.download(submission.batch.output("image"), image, [submission.event])
@@ -218,10 +222,9 @@ class Renderer:
             self.device.finish()
             for ring in self._rings.values():
                 ring.close()
-            for batch in self._preparations.values():
-                batch.close()
+            for held in self._frames.values():
+                held.preparation.close()
             self._rings.clear()
-            self._preparations.clear()
             self._frames.clear()
             self.device.close()
 
@@ -244,30 +247,31 @@ class Renderer:
         if held is not None:
             self._frames.move_to_end(key)
             return held
-        while len(self._frames) > self._slots:
-            _, old = self._frames.popitem(last=False)
-            self._free(old)
+        preparation = self._free_preparation(shape)
+        if preparation is None:
+            preparation = compile(_inverse_depth_program(shape), self.device)
         pool = self.device.pool
-        preparation = self._preparation(shape)
         color, depth = pool.to_device(frame.color, "upload color"), pool.to_device(frame.depth, "upload depth")
         submission = preparation.submit(
             {"color": color.buffer, "depth": depth.buffer}, wait_for=[*color.waits, *depth.waits]
         )
-        # The batch's own output would be overwritten by the next frame's.
-        inv_depth = pool.acquire(preparation.program.buffers["inv_depth"].nbytes)
-        ready = pool.copy(preparation.output("inv_depth"), inv_depth, [submission.event])
-        preparation.hold(ready)
         pool.free_input(depth, submission.event)
-        held = self._frames[key] = _DeviceFrame(frame, color, inv_depth, ready)
+        held = self._frames[key] = _DeviceFrame(frame, shape, color, preparation, submission.event)
         return held
 
-    def _free(self, held: _DeviceFrame) -> None:
-        self.device.pool.free_input(held.color, held.last_use)
-        self.device.pool.release(held.inv_depth, held.last_use)
-
-    def _preparation(self, shape: FrameShape) -> Batch:
-        key = (shape.layers, shape.height, shape.width, shape.is_opaque)
-        return _cached(self._preparations, key, lambda: compile(_inverse_depth_program(shape), self.device))
+    def _free_preparation(self, shape: FrameShape) -> Batch | None:
+        """Make room for one more frame; hand over what prepared the one that goes, if it fits the next."""
+        preparation = None
+        while len(self._frames) > self._slots:
+            _, old = self._frames.popitem(last=False)
+            self.device.pool.free_input(old.color, old.last_use)
+            if old.last_use is not None:
+                old.preparation.hold(old.last_use)
+            if preparation is None and old.shape == shape:
+                preparation = old.preparation
+            else:
+                old.preparation.close()
+        return preparation
 
     def _ring(self, shape: FrameShape, plan: Plan) -> FrameRing:
         return _cached(

@@ -202,6 +202,16 @@ class BufferPool:
             launch(self._queue, "download", cl.enqueue_copy, out, buffer, waits=waits, is_blocking=True)
         return out
 
+    def download(self, buffer: Any, out: NDArray[Any], waits: Sequence[Any] = ()) -> Any:
+        """Start copying the start of a buffer into a host array.
+
+        Returns
+        -------
+        pyopencl.Event
+            Complete when `out` is filled; until then it must be kept and not be touched.
+        """
+        return launch(self._queue, "download", cl.enqueue_copy, out, buffer, waits=waits, is_blocking=False).event
+
     @contextmanager
     def mapped(
         self, buffer: Any, shape: tuple[int, ...], dtype: DTypeLike, waits: Sequence[Any] = ()

@@ -25,7 +25,7 @@ __all__ = ["BUILD_OPTIONS", "Defines", "ProgramCache", "SourceDirectory", "defau
 
 # One dialect everywhere; argument info lets the scheduler check kernels against passes. No fast-math: see
 # docs/decisions.md.
-BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info")
+BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info", "-cl-denorms-are-zero")
 
 Defines = tuple[tuple[str, Any], ...]
 

@@ -49,10 +49,17 @@ typedef struct {
     int segment;     /* pixels of a row a work-group owns, a multiple of LAYERED_TILE */
 } LayeredStep;
 
-static inline float4 clamp01(float4 v)
+static inline float16 clamp01(float16 v)
 {
-    v = v < 0.0f ? (float4)(0.0f) : v;
-    return v > 1.0f ? (float4)(1.0f) : v;
+    v = v < 0.0f ? (float16)(0.0f) : v;
+    return v > 1.0f ? (float16)(1.0f) : v;
+}
+
+static inline float sum16(float16 v)
+{
+    float8 a = v.lo + v.hi;
+    float4 b = a.lo + a.hi;
+    return (b.x + b.y) + (b.z + b.w);
 }
 
 static inline float16 over(float16 front, float16 back)
@@ -60,53 +67,88 @@ static inline float16 over(float16 front, float16 back)
     return front + (1.0f - front.s33337777bbbbffff) * back;
 }
 
-/* Weight of a slot in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), which fall at once
+/* Weights of 16 slots in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), which fall at once
  * at the layer's back end. They may fall as gently as the first where the slot before them already stands in this layer
  * or in front of it (`before_falls` has not begun to fall): there nothing shows through that a nearer surface hides. */
-static inline float4 layered_weight(float4 w, float4 before, float4 matting, int peel)
+static inline float16 layered_weight(float16 w, float16 before, float4 matting, int peel)
 {
-    float4 up = clamp01(w * matting.x + matting.y);
-    float4 falling = w * matting.z + matting.w;
-    float4 down = clamp01(falling);
+    float16 falling = w * matting.z + matting.w;
+    float16 down = clamp01(falling);
     if (peel > 0) {
-        float4 before_falls = before * matting.z + matting.w;
-        down = before_falls >= 1.0f ? down : (falling >= 1.0f ? (float4)(1.0f) : (float4)(0.0f));
+        float16 before_falls = before * matting.z + matting.w;
+        float16 step = falling >= 1.0f ? (float16)(1.0f) : (float16)(0.0f);
+        down = before_falls >= 1.0f ? down : step;
     }
-    float4 weight = up * down;
-    return w < 0.0f ? (float4)(0.0f) : weight;
+    float16 weight = clamp01(w * matting.x + matting.y) * down;
+    return w < 0.0f ? (float16)(0.0f) : weight;
 }
 
-/* One layer (eq. 2) at the four pixels from x on: weighted slots, composed front to back.
- * `peels` has a bit for each peel that brings something to this tile. */
-static inline float16 layered_quad(const __global float *color, const __global float *inv_depth, LayeredSize size,
-                                   float4 matting, uint peels, int x, int y)
+/* Four slots of a peel as the current run composes them. */
+static inline float16 layered_color(float16 c, float4 w, int is_last)
 {
-    float16 layer = (float16)(0.0f);
-    const int valid = size.width - x;
+#if LAYERED_ALPHA_RUN
+    const float16 red = (float16)(1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0);
+    const float16 alpha = (float16)(0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1);
+    c = c.s33337777bbbbffff * red + c * alpha;
+#endif
+#if LAYERED_VOID
+    /* The void behind the last slot stands at its depth, that of an empty slot at infinity. */
+    float4 a = c.s37bf;
+    a = w == 0.0f && a == 0.0f ? (float4)(1.0f) : a;
+    c.s37bf = is_last ? (float4)(1.0f) : a;
+#endif
+    return c;
+}
+
+/* One layer (eq. 2) at the 16 pixels from x on, a multiple of 16: weighted slots, composed front to back.
+ * `peels` has a bit for each peel that brings something to this tile. Returns whether there is anything. */
+static inline int layered_block(float16 quad[4], const __global float *color, const __global float *inv_depth,
+                                LayeredSize size, float4 matting, uint peels, int x, int y)
+{
+    int any = 0;
+    quad[0] = quad[1] = quad[2] = quad[3] = (float16)(0.0f);
     for (int m = 0; m < size.peels; m++) {
         if (!(peels >> m & 1u)) continue;
         const size_t row = (size_t)m * size.height + y;
         const __global float *inv = inv_depth + row * size.pitch + x;
-        float4 w = load_pixel(inv);
-        float4 before = m > 0 ? load_pixel(inv - (size_t)size.height * size.pitch) : w;
-        float4 weight = layered_weight(w, before, matting, m);
-        if (weight.x + weight.y + weight.z + weight.w <= 0.0f) continue;
+        float16 w = load_quad(inv);
+        float16 before = m > 0 ? load_quad(inv - (size_t)size.height * size.pitch) : w;
+        float16 weight = layered_weight(w, before, matting, m);
+        if (sum16(weight) <= 0.0f) continue;
+        any = 1;
         const __global float *rgba = color + (row * size.width + x) * 4;
-        float16 c = valid >= 4 ? load_quad(rgba) : load_quad_part(rgba, valid);
-#if LAYERED_ALPHA_RUN
-        const float16 red = (float16)(1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0);
-        const float16 alpha = (float16)(0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1);
-        c = c.s33337777bbbbffff * red + c * alpha;
-#endif
-#if LAYERED_VOID
-        /* Nothing there has alpha 0 and counts as covered. */
-        float4 a = c.s37bf;
-        a = w == 0.0f && a == 0.0f ? (float4)(1.0f) : a;
-        c.s37bf = a;
-#endif
-        layer = over(layer, c * spread(weight));
+        const float4 weights[4] = {weight.s0123, weight.s4567, weight.s89ab, weight.scdef};
+        const float4 inverse[4] = {w.s0123, w.s4567, w.s89ab, w.scdef};
+#pragma unroll
+        for (int q = 0; q < 4; q++) {
+            int valid = size.width - x - 4 * q;
+            if (valid <= 0) continue;
+            float16 c = valid >= 4 ? load_quad(rgba + 16 * q) : load_quad_part(rgba + 16 * q, valid);
+            quad[q] = over(quad[q], layered_color(c, inverse[q], m == size.peels - 1) * spread(weights[q]));
+        }
+        /* Nothing shows through 16 opaque pixels: no need to read the peels behind them. */
+        if (sum16((float16)(quad[0].s37bf, quad[1].s37bf, quad[2].s37bf, quad[3].s37bf)) >= 16.0f) break;
     }
-    return layer;
+    return any;
+}
+
+/* Whether the quads at `line` are opaque in all rows: then there is no point in filtering what lies behind. */
+static inline int layered_hides(const __local float *line, int line_width)
+{
+    float4 covered = (float4)(0.0f);
+    for (int i = 0; i < FIR_ROWS; i++) covered += load_quad_local(line + i * line_width * 4).s37bf;
+    return covered.x + covered.y + covered.z + covered.w >= 4.0f * FIR_ROWS;
+}
+
+/* Compose filtered quads with those at `line`. */
+static inline void layered_add(__local float *line, int line_width, const float16 filtered[FIR_ROWS], int in_front)
+{
+#pragma unroll
+    for (int i = 0; i < FIR_ROWS; i++) {
+        __local float *at = line + i * line_width * 4;
+        float16 layer = load_quad_local(at);
+        store_quad_local(at, in_front ? over(filtered[i], layer) : over(layer, filtered[i]));
+    }
 }
 
 /* layered_classify: which peels bring something to which layer, per tile.
@@ -160,7 +202,7 @@ __kernel void layered_classify(__global uint *restrict tile_peels, const __globa
  * writes  out         float[height][pitch][4]
  *         reached_out int[tiles_y][tiles_x]
  * range   2-D groups: (segments of a row, blocks of FIR_ROWS rows); local size (any, 1)
- * local   lines  float[FIR_ROWS][segment + 2*halo][4], halo = radius_out + 4 rounded up to a multiple of 4
+ * local   lines  float[FIR_ROWS][segment + 2*halo][4], halo = radius_out + 4 rounded up to a multiple of 16
  *         state  int[segment / LAYERED_TILE + 2*ceil(halo / LAYERED_TILE)]  per tile: 1 blur reached it, 2 layer does */
 __kernel void layered_step(__global float *restrict out, __global int *restrict reached_out,
                            const __global float *restrict image, const __global int *restrict reached,
@@ -170,7 +212,7 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
                            __local int *restrict state)
 {
     const int lid = get_local_id(0), items = get_local_size(0);
-    const int halo = (step.radius_out + 7) & ~3;
+    const int halo = (step.radius_out + 19) & ~15; /* blocks of 16 pixels stay aligned */
     const int halo_tiles = (halo + LAYERED_TILE - 1) / LAYERED_TILE;
     const int line_width = step.segment + 2 * halo;
     const int x0 = (int)get_group_id(0) * step.segment;
@@ -197,29 +239,30 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    for (int b = lid; b < line_width / 4; b += items) {
-        int x = x0 - halo + 4 * b;
+    /* The layer by itself first, then what is composed so far: loops that mix both run at half the speed on CPUs. */
+    for (int b = lid; b < line_width / 16; b += items) {
+        int x = x0 - halo + 16 * b;
         if (x < 0 || x >= size.width) continue;
         int tx = x / LAYERED_TILE;
-        int s = state[tx - tile0];
-        __local float *line = lines + 16 * b;
-        if (s & 1) {
-            float16 acc[FIR_ROWS];
-            fir_columns(acc, image, x, y0, size.height, size.pitch, taps + step.taps_in, step.radius_in);
+        int is_here = state[tx - tile0] & 2;
+        __local float *line = lines + 64 * b;
+        for (int i = 0; i < FIR_ROWS; i++, line += line_width * 4) {
+            float16 layer[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+            if (is_here && y0 + i < size.height)
+                layered_block(layer, color, inv_depth, size, layer_matting, layer_peels[tx], x, y0 + i);
 #pragma unroll
-            for (int i = 0; i < FIR_ROWS; i++) store_quad_local(line + i * line_width * 4, acc[i]);
-        } else {
-            for (int i = 0; i < FIR_ROWS; i++) store_quad_local(line + i * line_width * 4, (float16)(0.0f));
+            for (int q = 0; q < 4; q++) store_quad_local(line + 16 * q, layer[q]);
         }
-        if (s & 2) {
-            uint peels = layer_peels[tx];
-            for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
-                float16 below = load_quad_local(line + i * line_width * 4);
-                float16 layer = layered_quad(color, inv_depth, size, layer_matting, peels, x, y0 + i);
-                below = step.in_front ? over(below, layer) : over(layer, below);
-                store_quad_local(line + i * line_width * 4, below);
-            }
-        }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int b = lid; b < line_width / 4; b += items) {
+        int x = x0 - halo + 4 * b;
+        if (x < 0 || x >= size.width || !(state[x / LAYERED_TILE - tile0] & 1)) continue;
+        __local float *line = lines + 16 * b;
+        if (!step.in_front && layered_hides(line, line_width)) continue;
+        float16 acc[FIR_ROWS];
+        fir_columns(acc, image, x, y0, size.height, size.pitch, taps + step.taps_in, step.radius_in);
+        layered_add(line, line_width, acc, step.in_front);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     fir_extend_lines(lines, line_width, x0 - halo, size.width);
@@ -246,28 +289,32 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
     }
 }
 
-/* Divide by coverage and store at the place the guard band leaves; see LAYERED_ALPHA_RUN for what the channels hold. */
-static inline void layered_finish_pixel(__global float *out, float4 v, LayeredSize size, int guard, int x, int y)
-{
-    int ox = x - guard, oy = y - guard;
-    int out_width = size.width - 2 * guard, out_height = size.height - 2 * guard;
-    if (ox < 0 || oy < 0 || ox >= out_width || oy >= out_height) return;
-    __global float *to = out + ((size_t)oy * out_width + ox) * 4;
-    float scale = v.w > LAYERED_MIN_COVERAGE ? 1.0f / v.w : 0.0f;
-#if LAYERED_ALPHA_RUN
-    float alpha = v.x * scale;
-    to[3] = alpha > 1.0f ? 1.0f : alpha;
-#else
-    store_pixel(to, (float4)(v.xyz * scale, scale > 0.0f ? 1.0f : 0.0f));
-#endif
-}
-
+/* Divide four pixels by coverage and store them at the place the guard band leaves; see LAYERED_ALPHA_RUN for what the
+ * channels hold. */
 static inline void layered_finish_quad(__global float *out, float16 v, LayeredSize size, int guard, int x, int y)
 {
-    layered_finish_pixel(out, v.s0123, size, guard, x, y);
-    layered_finish_pixel(out, v.s4567, size, guard, x + 1, y);
-    layered_finish_pixel(out, v.s89ab, size, guard, x + 2, y);
-    layered_finish_pixel(out, v.scdef, size, guard, x + 3, y);
+    const int ox = x - guard, oy = y - guard;
+    const int out_width = size.width - 2 * guard, out_height = size.height - 2 * guard;
+    if (oy < 0 || oy >= out_height || ox <= -4 || ox >= out_width) return;
+    float4 coverage = v.s37bf;
+    float4 scale = coverage > LAYERED_MIN_COVERAGE ? 1.0f / coverage : (float4)(0.0f);
+    v = v * spread(scale);
+#if LAYERED_ALPHA_RUN
+    float alpha[4] = {v.s0, v.s4, v.s8, v.sc};
+    for (int i = 0; i < 4; i++)
+        if (ox + i >= 0 && ox + i < out_width)
+            out[((size_t)oy * out_width + ox + i) * 4 + 3] = alpha[i] > 1.0f ? 1.0f : alpha[i];
+#else
+    v.s37bf = scale > 0.0f ? (float4)(1.0f) : (float4)(0.0f);
+    __global float *to = out + ((long)oy * out_width + ox) * 4;
+    if (ox >= 0 && ox + 4 <= out_width) {
+        store_quad(to, v);
+    } else {
+        float4 pixel[4] = {v.s0123, v.s4567, v.s89ab, v.scdef};
+        for (int i = 0; i < 4; i++)
+            if (ox + i >= 0 && ox + i < out_width) store_pixel(to + 4 * i, pixel[i]);
+    }
+#endif
 }
 
 typedef struct {
@@ -294,35 +341,47 @@ static inline int layered_is_reached(const __global int *reached, int below, int
  *         front_reached, back_reached  int[tiles_y][tiles_x]
  *         color, inv_depth, tile_peels, taps  as layered_step
  * writes  out  float[height - 2*guard][width - 2*guard][4]
- * range   2-D, one item per tile column and block of rows, any local size */
+ * range   2-D groups: one per tile; local size (any, 1)
+ * local   lines  float[FIR_ROWS][LAYERED_TILE][4] */
 __kernel void layered_resolve(__global float *restrict out, const __global float *restrict front,
                               const __global int *restrict front_reached, const __global float *restrict back,
                               const __global int *restrict back_reached, const __global float *restrict color,
                               const __global float *restrict inv_depth, const __global uint *restrict tile_peels,
                               const __global float *restrict taps, LayeredSize size, LayeredResolve resolve,
-                              LayeredMatting matting)
+                              LayeredMatting matting, __local float *restrict lines)
 {
-    const int tx = get_global_id(0), ty = get_global_id(1);
-    if (tx >= size.tiles_x || ty >= size.tiles_y) return;
-    const int y0 = ty * FIR_ROWS;
+    const int lid = get_local_id(0), items = get_local_size(0);
+    const int tx = get_group_id(0), ty = get_group_id(1);
+    const int x0 = tx * LAYERED_TILE, y0 = ty * FIR_ROWS;
     const float4 layer_matting = matting.layer[resolve.layer];
     const uint peels = tile_peels[((size_t)resolve.layer * size.tiles_y + ty) * size.tiles_x + tx];
     const int has_front = layered_is_reached(front_reached, resolve.front, tx, ty, resolve.radius_front, size);
     const int has_back = layered_is_reached(back_reached, resolve.back, tx, ty, resolve.radius_back, size);
-    const int x_end = (tx + 1) * LAYERED_TILE < size.width ? (tx + 1) * LAYERED_TILE : size.width;
 
-    for (int x = tx * LAYERED_TILE; x < x_end; x += 4) {
-        float16 f[FIR_ROWS], b[FIR_ROWS];
-        for (int i = 0; i < FIR_ROWS; i++) f[i] = b[i] = (float16)(0.0f);
-        if (has_front)
-            fir_columns(f, front, x, y0, size.height, size.pitch, taps + resolve.taps_front, resolve.radius_front);
-        if (has_back)
-            fir_columns(b, back, x, y0, size.height, size.pitch, taps + resolve.taps_back, resolve.radius_back);
-        for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
-            float16 v = b[i];
-            if (peels) v = over(layered_quad(color, inv_depth, size, layer_matting, peels, x, y0 + i), v);
-            layered_finish_quad(out, over(f[i], v), size, resolve.guard, x, y0 + i);
+    for (int b = lid; b < FIR_ROWS * LAYERED_TILE / 16; b += items) {
+        int x = x0 + b % (LAYERED_TILE / 16) * 16, i = b / (LAYERED_TILE / 16);
+        float16 layer[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+        if (peels && x < size.width && y0 + i < size.height)
+            layered_block(layer, color, inv_depth, size, layer_matting, peels, x, y0 + i);
+#pragma unroll
+        for (int q = 0; q < 4; q++) store_quad_local(lines + 64 * b + 16 * q, layer[q]);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int b = lid; b < LAYERED_TILE / 4; b += items) {
+        int x = x0 + 4 * b;
+        if (x >= size.width) continue;
+        __local float *line = lines + 16 * b;
+        float16 acc[FIR_ROWS];
+        if (has_back && !layered_hides(line, LAYERED_TILE)) {
+            fir_columns(acc, back, x, y0, size.height, size.pitch, taps + resolve.taps_back, resolve.radius_back);
+            layered_add(line, LAYERED_TILE, acc, 0);
         }
+        if (has_front) {
+            fir_columns(acc, front, x, y0, size.height, size.pitch, taps + resolve.taps_front, resolve.radius_front);
+            layered_add(line, LAYERED_TILE, acc, 1);
+        }
+        for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++)
+            layered_finish_quad(out, load_quad_local(line + i * LAYERED_TILE * 4), size, resolve.guard, x, y0 + i);
     }
 }
 

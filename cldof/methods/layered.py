@@ -143,9 +143,9 @@ class Layered:
             farthest = 0.0  # the void is a surface at infinity
         near_px, far_px = max(0.0, -(c1 * nearest + c0)), max(0.0, c1 * farthest + c0)
         stack = self._stack(near_px, far_px)
-        coc = layer_coc(stack, self.anchors)
+        coc = layer_coc(stack)
         params = np.zeros((), _MATTING)
-        params["layer"][: stack.count] = matting_functions(coc, stack.front, c1, c0, self.anchors)
+        params["layer"][: stack.count] = matting_functions(coc, c1, c0, self.anchors)
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},
@@ -197,23 +197,19 @@ def _variance(sigma: float) -> float:
     return gaussian.fir_variance(gaussian.fir_taps(sigma))
 
 
-def layer_coc(stack: LayerStack, anchors: str = "layer") -> NDArray[np.float64]:
+def layer_coc(stack: LayerStack) -> NDArray[np.float64]:
     """Signed CoC radius in px of each layer, (K,), rising; 0 for the layer in focus."""
     front = [-c for c in _side_coc(stack.front, stack.sigma_step)[:0:-1]]
     return np.array([*front, *_side_coc(stack.back, stack.sigma_step)])
 
 
-def matting_functions(
-    coc: NDArray[np.float64], focus: int, c1: float, c0: float, anchors: str = "layer"
-) -> NDArray[np.float64]:
+def matting_functions(coc: NDArray[np.float64], c1: float, c0: float, anchors: str = "layer") -> NDArray[np.float64]:
     """Matting functions as kernels/layered.cl takes them (Schedl & Wimmer 2012, eqs. 3-4).
 
     Parameters
     ----------
     coc : ndarray, (K,)
         Signed CoC radius of each layer in px, rising.
-    focus : int
-        Index of the layer in focus.
     c1, c0 : float
         The lens: ``C = c1 / z + c0``.
     anchors : {"layer", "midpoint"}
@@ -281,9 +277,7 @@ class _Builder:
         self.local_size = min(blocking.local_size, traits.max_work_group_size)
         self.blocking, self.local_limit = blocking, traits.local_mem_bytes
         self.tiles_x, self.tiles_y = -(-shape.width // _TILE), -(-shape.height // blocking.rows)
-        self.size = _struct(
-            _SIZE, shape.width, shape.height, shape.pitch, shape.layers, self.tiles_x, self.tiles_y
-        )
+        self.size = _struct(_SIZE, shape.width, shape.height, shape.pitch, shape.layers, self.tiles_x, self.tiles_y)
         self.image_bytes = shape.height * shape.pitch * 16
         self.pixels = shape.height * shape.width
         self.taps = _Taps()
@@ -382,11 +376,9 @@ class _Builder:
         self.buffers.append(Buffer(reached, self.tiles_x * self.tiles_y * 4))
         blocking = self.blocking
         segment = min(blocking.segment, -(-self.shape.width // _TILE) * _TILE)
-        step = _struct(
-            _STEP, layer, int(in_front), image.below, radius_in, taps_in, radius_out, taps_out, segment
-        )
+        step = _struct(_STEP, layer, int(in_front), image.below, radius_in, taps_in, radius_out, taps_out, segment)
         halo_tiles = -(-_halo(radius_out) // _TILE)
-        groups = (-(-self.shape.pitch // segment), self.tiles_y)
+        groups = (-(-self.shape.width // segment), self.tiles_y)
         self._add(
             "layered_step",
             (
@@ -463,8 +455,10 @@ class _Builder:
                 self.size,
                 resolve,
                 Param("matting", _MATTING),
+                Local(self.blocking.rows * _TILE * 16),
             ),
-            (self.tiles_x, self.tiles_y),
+            (self.tiles_x * self.local_size, self.tiles_y),
+            (self.local_size, 1),
             traffic_bytes=self.pixels * 16 * (1 + bool(front.below) + bool(back.below)),
         )
 
@@ -511,9 +505,10 @@ class _Builder:
 
 def _halo(radius: int) -> int:
     """Pixels that a line block reaches beyond its segment; as in kernels/layered.cl."""
-    return (radius + 7) & ~3
+    return (radius + 19) & ~15
 
 
 def _struct(dtype: np.dtype[Any], *values: int) -> np.generic:
-    scalar: np.generic = np.array(values, dtype)[()]
+    record: Any = np.array(values, dtype)
+    scalar: np.generic = record[()]
     return scalar

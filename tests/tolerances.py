@@ -1,0 +1,45 @@
+"""How far a pass may be from its float64 twin: one table. A looser row for a device needs a reason and a date."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Tolerance(NamedTuple):
+    """Absolute and relative error, and the share of pixels that may exceed them where ties decide."""
+
+    atol: float
+    rtol: float = 0.0
+    outliers: float = 0.0
+
+
+TOLERANCES = {
+    "frame_inverse_depth": Tolerance(0.0, 1e-6),
+    # float32 sums of up to 2 * 3 * 16 taps
+    "blur_fir": Tolerance(2e-6),
+    # against the same sections in float64
+    "blur_iir": Tolerance(5e-6),
+    # against the exact Gaussian, in 2-D on images in [0, 1]
+    "gaussian": Tolerance(1.5e-3),
+    # float32 CoC against float64: a slot may fall to the other side of a hard end
+    "layered_step": Tolerance(1e-5, outliers=1e-3),
+    "layered_under": Tolerance(2e-6),
+    "layered_finish": Tolerance(1e-6, 1e-6),
+    # a whole frame; a misplaced slot spreads over the blur that follows
+    "layered": Tolerance(3e-5, outliers=5e-3),
+}
+
+
+def assert_close(actual: np.ndarray, expected: np.ndarray, name: str) -> None:
+    """Compare within the row `name`; says how far off the worst pixel is."""
+    tolerance = TOLERANCES[name]
+    assert actual.shape == expected.shape
+    assert np.isfinite(actual).all(), f"{name}: {np.count_nonzero(~np.isfinite(actual))} values are not finite"
+    error = np.abs(actual.astype(np.float64) - expected)
+    bad = error > tolerance.atol + tolerance.rtol * np.abs(expected)
+    share = np.count_nonzero(bad) / bad.size
+    worst = np.unravel_index(int(error.argmax()), error.shape)
+    assert share <= tolerance.outliers, (
+        f"{name}: {share:.2%} of values off, worst by {error.max():.3g} at {tuple(map(int, worst))}: "
+        f"{actual[worst]} for {expected[worst]}"
+    )
