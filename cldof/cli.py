@@ -340,6 +340,8 @@ def _choose_lens(
         focus, where = _default_focus(frame)
         remarks.append(f"focus on {where}: {focus:.4g} m (--focus-distance or --focus-at sets another)")
 
+    focus = Lens(0.0, focus).focus_distance_m  # refuses an impossible one before anything is derived from it
+
     if arguments.f_number is not None:
         focal = arguments.focal_length
         if focal is None:
