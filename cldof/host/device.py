@@ -258,10 +258,12 @@ class Device:
 
     def close(self) -> None:
         """Release memory and programs; the queue and the context too, unless they are the caller's."""
-        if self._owned and self.queue is not None:
-            self.queue.finish()
-        self.pool.close()
-        self.programs.clear()
+        try:
+            if self._owned:
+                self.finish()
+        finally:
+            self.pool.close()
+            self.programs.clear()
 
     def __enter__(self) -> Device:
         return self

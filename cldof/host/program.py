@@ -8,6 +8,7 @@ rusticl. For the same reason programs are built through ``pyopencl._cl``: ``pyop
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -16,6 +17,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Protocol
 
+import numpy as np
+
 from ..errors import BuildError, InputError, OutputError
 from ..files import atomic_write
 from . import opencl as cl
@@ -23,8 +26,8 @@ from .quirks import Effect, effects_of, user_cache_dir
 
 __all__ = ["BUILD_OPTIONS", "Defines", "ProgramCache", "SourceDirectory", "default_cache_dir", "expand", "numbered"]
 
-# One dialect everywhere; argument info lets the scheduler check kernels against passes. No fast-math: see
-# docs/decisions.md.
+# One dialect everywhere; argument info lets the scheduler check kernels against passes. No fast-math: it lets compilers
+# drop tests for NaN and infinity.
 BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info", "-cl-denorms-are-zero")
 
 Defines = tuple[tuple[str, Any], ...]
@@ -61,9 +64,7 @@ def expand(stem: str, defines: Defines, directory: SourceDirectory) -> str:
     BuildError
         A file is missing, or includes itself.
     """
-    lines = [f"#define {name} {_literal(name, value)}" for name, value in defines]
-    lines += _expanded(f"{stem}.cl", directory, ())
-    return "\n".join(lines) + "\n"
+    return "\n".join((*_define_lines(defines), *_expanded(f"{stem}.cl", directory, ()))) + "\n"
 
 
 def numbered(source: str) -> str:
@@ -103,7 +104,7 @@ class ProgramCache:
         self._context = context
         self._device = device
         self._directory = directory
-        self._programs: dict[str, Any] = {}
+        self._programs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._lock = Lock()
         driver_caches = Effect.DRIVER_CACHES_BUILDS in effects_of(device.platform.name, device.name)
         self._disk = None if driver_caches else _DiskCache(cache_dir or default_cache_dir())
@@ -131,20 +132,21 @@ class ProgramCache:
 
     def program(self, stem: str, defines: Defines = ()) -> Any:
         """The built program of ``<stem>.cl`` with those defines."""
-        source = expand(stem, defines, self._directory)
-        key = self._key(source)
+        # By text, since 1, 1.0 and True are the same key but not the same define.
+        key = (stem, _define_lines(defines))
         with self._lock:
             program = self._programs.get(key)
             if program is None:
-                program = self._programs[key] = self._build(key, source)
+                program = self._programs[key] = self._build(expand(stem, defines, self._directory))
         return program
 
     def clear(self) -> None:
-        """Forget the programs in memory."""
+        """Forget the programs in memory; files that changed are read again."""
         with self._lock:
             self._programs.clear()
 
     def _key(self, source: str) -> str:
+        """Name in the disk cache: a digest of all that the binary depends on."""
         platform = self._device.platform
         parts = (
             source,
@@ -160,7 +162,8 @@ class ProgramCache:
             digest.update(b"\0")  # so that ("ab", "c") and ("a", "bc") differ
         return digest.hexdigest()
 
-    def _build(self, key: str, source: str) -> Any:
+    def _build(self, source: str) -> Any:
+        key = self._key(source)
         if self._disk and (binary := self._disk.load(key)):
             program = self._from_binary(binary)
             if program is not None:
@@ -230,14 +233,24 @@ def _expanded(name: str, directory: SourceDirectory, above: tuple[str, ...]) -> 
             yield line
 
 
+def _define_lines(defines: Defines) -> tuple[str, ...]:
+    return tuple(f"#define {name} {_literal(name, value)}" for name, value in defines)
+
+
 def _literal(name: str, value: Any) -> str:
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, bool):
         return str(int(value))
-    if isinstance(value, (int, str)):
-        return str(value)
-    if isinstance(value, float):
-        return float.hex(value) + "f"  # exact, and legal in OpenCL C
-    raise InputError(f"compile-time constant {name} = {value!r} must be an int, float, bool or str")
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int):
+        text = str(value)
+    elif isinstance(value, float) and math.isfinite(value):
+        text = value.hex() + "f"  # exact, and legal in OpenCL C
+    else:
+        raise InputError(f"compile-time constant {name} = {value!r} must be an int, finite float, bool or str")
+    return f"({text})" if text.startswith("-") else text
 
 
 def _encoded(options: Sequence[str]) -> bytes:

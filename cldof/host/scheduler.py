@@ -176,7 +176,10 @@ class Batch:
         return Submission(event, tuple(launched) if self.device.is_profiling else (), self)
 
     def hold(self, event: Any) -> None:
-        """Have the next submission wait for `event`, for instance a download of this frame's output."""
+        """Have the next submission wait for `event`, for instance a download of this frame's output.
+
+        The memory, too, is not used for anything else before, should the batch be closed.
+        """
         self._users.append(event)
 
     def output(self, name: str) -> Any:
@@ -194,8 +197,12 @@ class Batch:
 
     def close(self) -> None:
         """Give the memory back; work under way is not disturbed."""
+        after = self._last
+        if self._owned and self._users:
+            uses = [event for event in (self._last, *self._users) if event is not None]
+            after = launch(self.device.queue, "last use", cl.enqueue_marker, waits=uses).event
         for buffer in self._owned:
-            self.device.pool.release(buffer, self._last)
+            self.device.pool.release(buffer, after)
         self._owned.clear()
 
     def __enter__(self) -> Batch:

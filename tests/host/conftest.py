@@ -34,12 +34,13 @@ __kernel void toy_add(__global float *out, __global const float *restrict a, con
         out[i] = toy_times(a[i]) + term;
 }
 
-/* toy_slow_add: the same after many idle turns, so that what does not wait for it comes too early. */
-__kernel void toy_slow_add(__global float *out, __global const float *restrict a, const int n, const float term)
+/* toy_late_reverse: out = a + term back to front; the last item, which the next pass needs first, takes its time. */
+__kernel void toy_late_reverse(__global float *out, __global const float *restrict a, const int n, const float term)
 {
     const int i = get_global_id(0);
-    float x = a[i < n ? i : 0];
-    for (int turn = 0; turn < 2000; ++turn)
+    float x = a[i < n ? n - 1 - i : 0];
+    const int turns = i == n - 1 ? 2000000 : 0;
+    for (int turn = 0; turn < turns; ++turn)
         x = x + (turn & 1 ? 1.0f : -1.0f);
     if (i < n)
         out[i] = x + term;
@@ -123,6 +124,8 @@ def make_gate() -> Iterator[Callable[[Device], Gate]]:
     gates: list[Gate] = []
 
     def make(device: Device) -> Gate:
+        if device.info.name.startswith("basic"):
+            pytest.skip("PoCL's basic device runs commands in the calling thread, which would wait for itself")
         gates.append(Gate(device))
         return gates[-1]
 

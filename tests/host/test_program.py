@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cldof.errors import BuildError, InputError
@@ -75,8 +76,20 @@ def test_missing_and_circular_files_are_named(sources: Path) -> None:
 
 def test_odd_defines_are_refused(sources: Path) -> None:
     (sources / "toy.cl").write_text(KERNEL)
-    with pytest.raises(InputError, match=r"N = \[1\] must be"):
-        expand("toy", (("N", [1]),), sources)
+    for value in ([1], float("inf"), None):
+        with pytest.raises(InputError, match=r"N = .* must be"):
+            expand("toy", (("N", value),), sources)
+
+
+def test_defines_are_exact(sources: Path) -> None:
+    (sources / "toy.cl").write_text("")
+    defines = (("A", -3), ("B", np.float32(-0.5)), ("C", np.int64(7)), ("D", "x + y"))
+    assert expand("toy", defines, sources).splitlines()[:4] == [
+        "#define A (-3)",
+        "#define B (-0x1.0000000000000p-1f)",
+        "#define C 7",
+        "#define D x + y",
+    ]
 
 
 def test_build_errors_can_be_read(cached: Callable[[], ProgramCache], sources: Path, device: Device) -> None:
@@ -114,9 +127,12 @@ def test_sources_defines_and_files_are_part_of_the_key(cached: Callable[[], Prog
     (sources / "toy.cl").write_text(KERNEL)
     cache = cached()
     first = cache.program("toy")
-    assert cache.program("toy", (("N", 1),)) is not first
-    (sources / "toy.cl").write_text(KERNEL + "// changed\n")
-    assert cache.program("toy") is not first
+    variants = [cache.program("toy", (("N", value),)) for value in (1, 1.0, 2)]
+    assert len({program.int_ptr for program in (first, *variants)}) == 4
+    (sources / "toy.cl").write_text(KERNEL.replace("toy_one", "toy_two"))
+    assert cache.program("toy") is first
+    cache.clear()
+    assert cache.kernel("toy", "toy_two").num_args == 1  # not the binary on disk
 
 
 def test_disk_cache_is_used(

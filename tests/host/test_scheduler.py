@@ -13,6 +13,7 @@ import pytest
 from cldof.errors import DeviceError, InputError
 from cldof.host import hazards, scheduler
 from cldof.host import opencl as cl
+from cldof.host.buffers import BufferPool
 from cldof.host.device import Device, DeviceInfo
 from cldof.host.passes import Buffer, FrameProgram, Local, Param, Pass, Role, read, read_write, write
 
@@ -27,7 +28,7 @@ def add(out: str, a: str, term: Any, n: int = N, kernel: str = "toy_add", **chan
 
 
 def chain(length: int, kernel: str = "toy_add", n: int = N) -> FrameProgram:
-    """out = in + length, by one pass per step."""
+    """out = in + length, by one pass per step; an even number of reversing passes is none."""
     names = ["in", *(f"t{i}" for i in range(length - 1)), "out"]
     buffers = [Buffer(name, 4 * n) for name in names[1:-1]]
     buffers += [Buffer("in", 4 * n, Role.INPUT), Buffer("out", 4 * n, Role.OUTPUT)]
@@ -62,7 +63,7 @@ def test_results_do_not_depend_on_what_shares_memory(any_queue: Device) -> None:
         [
             Pass("toy", "toy_fill", (write("a"), np.int32(N), np.float32(1)), (N,)),
             Pass("toy", "toy_fill", (write("b"), np.int32(N), np.float32(10)), (N,)),
-            add("c", "a", np.float32(100), kernel="toy_slow_add"),
+            add("c", "a", np.float32(100), kernel="toy_late_reverse"),
             add("d", "b", np.float32(1000)),
             Pass("toy", "toy_increment", (read_write("d"), np.int32(N)), (N,)),
             add("e", "c", np.float32(0)),
@@ -109,16 +110,16 @@ def test_defines_make_variants(toy: Device) -> None:
 # -- waits
 
 
-def slow_chain_is_right(device: Device) -> bool:
+def late_chain_is_right(device: Device) -> bool:
     host = np.arange(N, dtype=np.float32)
     source = device.pool.to_device(host)
-    with scheduler.compile(chain(6, "toy_slow_add"), device) as batch:
+    with scheduler.compile(chain(6, "toy_late_reverse"), device) as batch:
         submission = batch.submit({"in": source.buffer}, wait_for=source.waits)
         return bool((output(batch, submission) == host + 6).all())
 
 
 def test_waits_order_an_out_of_order_queue(toy_out_of_order: Device) -> None:
-    assert all(slow_chain_is_right(toy_out_of_order) for _ in range(5))
+    assert all(late_chain_is_right(toy_out_of_order) for _ in range(5))
 
 
 def test_without_waits_an_out_of_order_queue_goes_wrong(
@@ -126,7 +127,7 @@ def test_without_waits_an_out_of_order_queue_goes_wrong(
 ) -> None:
     """What shows that the test above tests something."""
     monkeypatch.setattr(hazards, "waits", lambda steps: tuple(() for _ in steps))
-    if all(slow_chain_is_right(toy_out_of_order) for _ in range(20)):
+    if all(late_chain_is_right(toy_out_of_order) for _ in range(20)):
         pytest.skip(f"{toy_out_of_order.info.name} ran 20 frames in order of its own accord")
 
 
@@ -179,7 +180,7 @@ def test_resubmission_waits_for_the_frame_before_it(toy_out_of_order: Device) ->
         [Buffer("out", 4 * N, Role.OUTPUT), Buffer("t", 4 * N)],
         [
             Pass("toy", "toy_fill", (write("t"), np.int32(N), Param("value", F32)), (N,)),
-            add("out", "t", np.float32(0), kernel="toy_slow_add"),
+            add("out", "t", np.float32(0), kernel="toy_late_reverse"),
         ],
     )
     with scheduler.compile(program, device) as batch:
@@ -198,7 +199,7 @@ def test_resubmission_waits_for_the_frame_before_it(toy_out_of_order: Device) ->
 
 
 def test_frames_in_flight_are_independent(any_queue: Device) -> None:
-    program = chain(6, "toy_slow_add")
+    program = chain(6, "toy_late_reverse")
     hosts = [np.full(N, value, np.float32) for value in range(3)]
     sources = [any_queue.pool.to_device(host) for host in hosts]
     with scheduler.FrameRing(program, any_queue, slots=3) as ring:
@@ -244,6 +245,24 @@ def test_closing_gives_the_memory_back(toy: Device) -> None:
     with scheduler.compile(chain(4), toy):
         assert toy.pool.in_use_bytes > before
     assert toy.pool.in_use_bytes == before
+
+
+def test_memory_of_a_closed_batch_is_held_for_its_readers(
+    toy_out_of_order: Device, make_gate: Callable[[Device], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = toy_out_of_order
+    gate = make_gate(device)
+    pool = BufferPool(device.context, device.queue, shares_memory=True)
+    monkeypatch.setattr(device, "pool", pool)
+    source = pool.to_device(np.zeros(N, np.float32))
+    with scheduler.compile(chain(1), device) as batch:
+        batch.submit({"in": source.buffer}).wait()
+        batch.hold(gate.event)
+        held = batch.output("out")
+    assert pool.acquire(4 * N) is not held
+    gate.open()
+    device.finish()
+    assert pool.acquire(4 * N) is held
 
 
 # -- refusals
