@@ -59,8 +59,9 @@ def _claim_pocl_cache() -> IO[str] | None:
     return None
 
 
-# Before anything imports pyopencl.
+# Before anything imports pyopencl. The variables also reach subprocesses.
 _pocl_cache_lock = _claim_pocl_cache()
+os.environ["CLDOF_CACHE_DIR"] = str(Path(os.environ["POCL_CACHE_DIR"]) / "cldof")
 
 
 def _find_devices() -> tuple[list[DeviceInfo], str]:

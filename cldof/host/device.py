@@ -131,7 +131,7 @@ class Device:
         How the queue was made.
     check_signatures : bool
         Whether passes are checked against the kernels' argument lists when a frame is compiled. Meant for tests: it
-        relies on what drivers say about arguments.
+        relies on what drivers say about arguments, and does without binaries from disk, which say nothing.
     """
 
     def __init__(
@@ -153,7 +153,9 @@ class Device:
         properties = queue.properties
         self.is_out_of_order = bool(properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE)
         self.is_profiling = bool(properties & cl.command_queue_properties.PROFILING_ENABLE)
-        self.programs = ProgramCache(context, self._cl_device, sources or files("cldof.kernels"))
+        self.programs = ProgramCache(
+            context, self._cl_device, sources or files("cldof.kernels"), from_source=check_signatures
+        )
         self.pool = BufferPool(context, queue, shares_memory=_shares_memory(self._cl_device))
 
     @classmethod

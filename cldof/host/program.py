@@ -98,16 +98,26 @@ class ProgramCache:
         Where the ``.cl`` and ``.clh`` files are.
     cache_dir : Path, optional
         Of the disk cache; :func:`default_cache_dir` unless told otherwise.
+    from_source : bool
+        Never load binaries: on some drivers a program from a binary has no argument info.
     """
 
-    def __init__(self, context: Any, device: Any, directory: SourceDirectory, cache_dir: Path | None = None) -> None:
+    def __init__(
+        self,
+        context: Any,
+        device: Any,
+        directory: SourceDirectory,
+        cache_dir: Path | None = None,
+        *,
+        from_source: bool = False,
+    ) -> None:
         self._context = context
         self._device = device
         self._directory = directory
         self._programs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._lock = Lock()
         driver_caches = Effect.DRIVER_CACHES_BUILDS in effects_of(device.platform.name, device.name)
-        self._disk = None if driver_caches else _DiskCache(cache_dir or default_cache_dir())
+        self._disk = None if driver_caches or from_source else _DiskCache(cache_dir or default_cache_dir())
 
     def kernel(self, stem: str, name: str, defines: Defines = ()) -> Any:
         """A new kernel object of ``<stem>.cl``; the program behind it is built at most once.
