@@ -114,6 +114,7 @@ class Batch:
         self._in_flight: deque[tuple[Any, tuple[Any, ...]]] = deque()
         self._users: list[Any] = []
         self._last: Any = None
+        self._closed = False
         self._bound: dict[str, Any] = {}
         self._input_uses: dict[str, list[tuple[Any, int]]] = {}
         self._params: dict[str, _Parameter] = {}
@@ -151,15 +152,17 @@ class Batch:
         Raises
         ------
         InputError
-            An input or parameter is missing, unknown or of the wrong size.
+            An input or parameter is missing, unknown or of the wrong size, or the batch is closed.
         DeviceError
             The device refused a pass.
         """
+        if self._closed:
+            raise InputError("a frame was submitted to a batch that is closed")
         inputs = inputs if inputs is not None else {}
         self._bind(inputs)
         self._set(params if params is not None else {})
         before = [*wait_for, *self._users]
-        if self._last is not None:
+        if self._last is not None and self.device.is_out_of_order:
             before.append(self._last)
         self._users.clear()
         try:
@@ -197,6 +200,7 @@ class Batch:
 
     def close(self) -> None:
         """Give the memory back; work under way is not disturbed."""
+        self._closed = True
         after = self._last
         if self._owned and self._users:
             uses = [event for event in (self._last, *self._users) if event is not None]

@@ -142,8 +142,9 @@ def test_in_order_queues_are_given_no_waits(toy: Device, monkeypatch: pytest.Mon
     source = toy.pool.to_device(np.zeros(N, np.float32))
     with scheduler.compile(chain(4), toy) as batch:
         monkeypatch.setattr(scheduler, "launch", spy)
+        batch.submit({"in": source.buffer})
         batch.submit({"in": source.buffer}).wait()
-    assert given == [[], [], [], []]
+    assert given == [[]] * 8
 
 
 def test_frame_waits_for_the_callers_events(toy_out_of_order: Device, make_gate: Callable[[Device], Any]) -> None:
@@ -245,6 +246,14 @@ def test_closing_gives_the_memory_back(toy: Device) -> None:
     with scheduler.compile(chain(4), toy):
         assert toy.pool.in_use_bytes > before
     assert toy.pool.in_use_bytes == before
+
+
+def test_a_closed_batch_takes_no_frames(toy: Device) -> None:
+    source = toy.pool.to_device(np.zeros(N, np.float32))
+    with scheduler.compile(chain(1), toy) as batch:
+        pass
+    with pytest.raises(InputError, match="closed"):
+        batch.submit({"in": source.buffer})
 
 
 def test_memory_of_a_closed_batch_is_held_for_its_readers(
