@@ -93,8 +93,8 @@ class PassOptions:
     """What a pass does beyond drawing.
 
     ``lens_reach_m``: back faces of single-sided materials are dropped unless a lens point within this radius sees their
-    front; 0 drops all that this view sees from behind, None keeps them all. ``stop_at_opaque``: nothing is peeled behind an opaque fragment. ``surface``: write
-    normals and albedo too.
+    front; 0 drops all that this view sees from behind, None keeps them all. ``stop_at_opaque``: nothing is peeled
+    behind an opaque fragment. ``surface``: write normals and albedo too.
     """
 
     lens_reach_m: float | None = None
@@ -359,23 +359,25 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
             # Front to back, so that the depth test spares shading; ties keep the scene's order.
             depths = [-(to_camera[2, :3] @ item.centre + to_camera[2, 3]) for item in self._items]
             gl.glBeginQuery(gl.GL_ANY_SAMPLES_PASSED, self._query)
-            for index in np.argsort(depths, kind="stable"):
-                item = self._items[index]
-                program = self._program("surface", {**item.defines, **surface}, prepared, common)
-                program.set(item.uniforms)
-                program.set({"model_view": to_camera @ item.transform})
-                self._draw_item(item, cull=options.lens_reach_m == 0.0 and "DOUBLE_SIDED" not in item.defines)
-            if scene.background is not None:
-                sky = scene.background
-                top, bottom = (sky.top, sky.bottom) if isinstance(sky, Gradient) else (sky, sky)
-                program = self._program("sky", surface, prepared, common)
-                program.set({"sky_top": np.array(top), "sky_bottom": np.array(bottom)})
-                gl.glDepthFunc(gl.GL_GEQUAL)
-                gl.glDisable(gl.GL_CULL_FACE)
-                gl.glBindVertexArray(self._empty_vertex_array)
-                gl.glDrawArrays(gl.GL_TRIANGLES, 0, 3)
-                gl.glBindVertexArray(0)
-            gl.glEndQuery(gl.GL_ANY_SAMPLES_PASSED)
+            try:
+                for index in np.argsort(depths, kind="stable"):
+                    item = self._items[index]
+                    program = self._program("surface", {**item.defines, **surface}, prepared, common)
+                    program.set(item.uniforms)
+                    program.set({"model_view": to_camera @ item.transform})
+                    self._draw_item(item, cull=options.lens_reach_m == 0.0 and "DOUBLE_SIDED" not in item.defines)
+                if scene.background is not None:
+                    sky = scene.background
+                    top, bottom = (sky.top, sky.bottom) if isinstance(sky, Gradient) else (sky, sky)
+                    program = self._program("sky", surface, prepared, common)
+                    program.set({"sky_top": np.array(top), "sky_bottom": np.array(bottom)})
+                    gl.glDepthFunc(gl.GL_GEQUAL)
+                    gl.glDisable(gl.GL_CULL_FACE)
+                    gl.glBindVertexArray(self._empty_vertex_array)
+                    gl.glDrawArrays(gl.GL_TRIANGLES, 0, 3)
+                    gl.glBindVertexArray(0)
+            finally:
+                gl.glEndQuery(gl.GL_ANY_SAMPLES_PASSED)
             gl.glUseProgram(0)
             return bool(np.ravel(gl.glGetQueryObjectuiv(self._query, gl.GL_QUERY_RESULT))[0])
 

@@ -34,19 +34,22 @@ def ray_layers(scene: Scene, camera: Camera, layers: int) -> NDArray[np.float64]
     """Sorted planar depths of the first hits of each pixel's ray, from Embree."""
     pytest.importorskip("embreex")
     mesh = trimesh.util.concatenate([n.mesh.copy().apply_transform(n.transform) for n in scene.nodes])
-    rays = pixel_rays(camera).reshape(-1, 3)
-    origins = np.broadcast_to(camera.pose[:3, 3], rays.shape)
-    ray = trimesh.ray.ray_pyembree.RayMeshIntersector(mesh)
-    places, index, _ = ray.intersects_location(origins, rays, multiple_hits=True)
-    depth = -((places - camera.pose[:3, 3]) @ camera.pose[:3, 2])
-    order = np.lexsort((depth, index))
-    index, depth = index[order], depth[order]
-    # Embree reports both triangles of a shared edge.
-    again = (np.diff(index) == 0) & (np.diff(depth) <= 2e-5 * depth[1:])
-    index, depth = index[np.r_[True, ~again]], depth[np.r_[True, ~again]]
-    rank = np.arange(len(index)) - np.searchsorted(index, index)
-    out = np.full((layers, len(rays)), np.inf)
-    out[rank[rank < layers], index[rank < layers]] = depth[rank < layers]
+    first_hit = trimesh.ray.ray_pyembree.RayMeshIntersector(mesh).intersects_first
+    corners, normals = mesh.triangles, mesh.face_normals
+    rays, eye = pixel_rays(camera).reshape(-1, 3), camera.pose[:3, 3]
+    out, found = np.full((layers, len(rays)), np.inf), np.zeros(len(rays), int)
+    active, reached, last = np.arange(len(rays)), np.zeros(len(rays)), np.zeros(len(rays))
+    while active.size:
+        # Embree finds the triangle, float64 the depth; then on from just behind it.
+        triangle = first_hit(eye + reached[active, None] * rays[active], rays[active])
+        active, triangle = active[triangle >= 0], triangle[triangle >= 0]
+        normal, ray = normals[triangle], rays[active]
+        depth = np.einsum("ij,ij->i", normal, corners[triangle, 0] - eye) / np.einsum("ij,ij->i", normal, ray)
+        new = depth > last[active] * (1.0 + 2e-5)  # Embree reports both triangles of a shared edge
+        out[found[active[new]], active[new]] = last[active[new]] = depth[new]
+        found[active[new]] += 1
+        reached[active] = np.maximum(depth, reached[active]) * (1.0 + 5e-6)
+        active = active[found[active] < layers]
     return out.reshape(layers, camera.height, camera.width)
 
 
