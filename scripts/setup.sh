@@ -2,7 +2,7 @@
 # Make .venv ready, from nothing: setup.sh core|test
 #
 # Installs what is missing and no more; a second run is instant. Uses apt-get (with sudo when not root) for three
-# things that pip cannot bring: Python's own venv module, the linker that PoCL calls, and an EGL/OpenGL driver.
+# things that pip cannot bring: Python's own venv module, what PoCL links its kernels with, and an EGL/OpenGL driver.
 # Where apt-get or the right to use it is missing it says what to install and goes on if it can.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -10,6 +10,7 @@ cd "$(dirname "$0")/.."
 extra=${1:-core}
 venv=.venv
 stamp=$venv/.cldof-$extra
+cl_stamp=$venv/.cldof-cl
 gl_stamp=$venv/.cldof-gl
 
 say() { printf '%s\n' "cldof setup: $*" >&2; }
@@ -77,19 +78,28 @@ if [ ! -e "$stamp" ] || [ setup.cfg -nt "$stamp" ] || [ pyproject.toml -nt "$sta
     touch "$stamp"
 fi
 
-# PoCL, the OpenCL driver that pip brings, links its kernels with the system's ld and aborts without one.
-if ! command -v ld >/dev/null && ! apt_install binutils; then
-    say "no linker (ld): PoCL cannot build kernels; install the package binutils"
-fi
+# Proved by use, not by looking for files: a vendor's driver counts as well. Drivers may be talkative while they fail.
+prove() { ( "$venv/bin/python" -c "$1" ) >"$venv/$2.log" 2>&1; }
+have_cl() { prove 'from cldof.host.device import Device; Device.open().traits' cl; }
+have_gl() { prove 'from cldof.capture.peel import DepthPeeler; DepthPeeler(8, 8).close()' gl; }
+why() { tail -n 1 "$venv/$1.log"; }
 
-# Proved by making a context, not by looking for files. Mesa's driver may be quite talkative while it fails.
-have_gl() { "$venv/bin/python" -c 'from cldof.capture.peel import DepthPeeler; DepthPeeler(8, 8).close()' 2>"$venv/gl-probe.log"; }
+# PoCL, the OpenCL driver that pip brings, links each kernel against libgcc and libc with the system's ld, and aborts the
+# process where one of them is missing.
+if [ ! -e "$cl_stamp" ]; then
+    if have_cl || { apt_install gcc libc6-dev && have_cl; }; then
+        touch "$cl_stamp"
+    else
+        say "no OpenCL device works here ($(why cl)): nothing can be rendered;" \
+            "for PoCL on the CPU install gcc and libc6-dev, for a GPU its driver."
+    fi
+fi
 
 if [ ! -e "$gl_stamp" ]; then
     if have_gl || { apt_install libegl1 libgl1 libgl1-mesa-dri && have_gl; }; then
         touch "$gl_stamp"
     else
-        say "no offscreen OpenGL here ($(tail -n 1 "$venv/gl-probe.log")): scenes cannot be captured;" \
+        say "no offscreen OpenGL here ($(why gl)): scenes cannot be captured;" \
             "install libegl1 libgl1 libgl1-mesa-dri. Frames of your own (.npz, arrays) still render."
     fi
 fi
