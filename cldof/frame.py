@@ -147,6 +147,12 @@ class LayeredFrame:
             transmittance = transmittance * (1.0 - layer[..., 3])
         return not bool((transmittance > _OPAQUE_TOLERANCE).any())
 
+    @cached_property
+    def has_glass(self) -> bool:
+        """True when some slot lets part of what is behind it through: alpha neither 0 nor 1."""
+        alpha = self.color[..., 3]
+        return bool(((alpha > 0.0) & (alpha < 1.0 - _OPAQUE_TOLERANCE)).any())
+
     def pinhole_image(self) -> NDArray[np.float32]:
         """All layers composited without any blur: what a lens of radius 0 sees. (H, W, 4), guard band cropped."""
         guard = self.guard_px

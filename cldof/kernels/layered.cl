@@ -28,11 +28,30 @@
 #define LAYERED_ALPHA_RUN 0
 #endif
 
+/* 1: some slots are neither empty nor opaque. */
+#ifndef LAYERED_GLASS
+#define LAYERED_GLASS 0
+#endif
+/* 1: matting functions as published, without what layered_weight and layered_glass add. */
+#ifndef LAYERED_PAPER
+#define LAYERED_PAPER 0
+#endif
+/* Slots at least this opaque take the matting weights of opaque ones. */
+#define LAYERED_OPAQUE 0.998f
+
 /* Matting functions of all layers, per layer (up scale, up offset, down scale, down offset): with w the inverse depth,
- * clamp(w * scale + offset, 0, 1) rises over the interval before the layer and falls over the one behind it. */
+ * clamp(w * scale + offset, 0, 1) rises over the interval before the layer and falls over the one behind it.
+ * Reach is how far, in px, a layer's blur opens a gap to its neighbour. */
 typedef struct {
     float4 layer[LAYERED_MAX_LAYERS];
+    float reach[LAYERED_MAX_LAYERS];
 } LayeredMatting;
+
+/* What a layer needs of that: its own functions and those of the layer before it (zeros for the first). */
+typedef struct {
+    float4 own, before;
+    float reach;
+} LayeredLayer;
 
 typedef struct {
     int width, height, pitch, peels, tiles_x, tiles_y;
@@ -67,20 +86,64 @@ static inline float16 over(float16 front, float16 back)
     return front + (1.0f - front.s33337777bbbbffff) * back;
 }
 
-/* Weights of 16 slots in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), which fall at once
- * at the layer's back end. They may fall as gently as the first where the slot before them already stands in this layer
- * or in front of it (`before_falls` has not begun to fall): there nothing shows through that a nearer surface hides. */
-static inline float16 layered_weight(float16 w, float16 before, float4 matting, int peel)
+static inline LayeredLayer layered_layer(const LayeredMatting *matting, int k)
 {
-    float16 falling = w * matting.z + matting.w;
-    float16 down = clamp01(falling);
-    if (peel > 0) {
-        float16 before_falls = before * matting.z + matting.w;
-        float16 step = falling >= 1.0f ? (float16)(1.0f) : (float16)(0.0f);
-        down = before_falls >= 1.0f ? down : step;
+    LayeredLayer layer = {matting->layer[k], k > 0 ? matting->layer[k - 1] : (float4)(0.0f), matting->reach[k]};
+    return layer;
+}
+
+static inline float16 layered_least_step(float16 w, float16 a, float16 b)
+{
+    float16 to_a = w > a ? w - a : a - w, to_b = w > b ? w - b : b - w;
+    to_a = a < 0.0f ? (float16)(MAXFLOAT) : to_a;
+    to_b = b < 0.0f ? (float16)(MAXFLOAT) : to_b;
+    to_a = to_a < to_b ? to_a : to_b;
+    return to_a < MAXFLOAT ? to_a : (float16)(0.0f);
+}
+
+/* Change of inverse depth from one pixel to the next, for 16 slots: the lesser of both sides, so that a silhouette does
+ * not count as a slope, and the greater of both directions. */
+static inline float16 layered_slope(const __global float *inv, float16 w, LayeredSize size, int x, int y)
+{
+    const float16 none = (float16)(EMPTY);
+    float16 left = x > 0 ? load_quad(inv - 1) : (float16)(EMPTY, w.s01234567, w.s89ab, w.scd, w.se);
+    float16 right = x + 16 < size.pitch ? load_quad(inv + 1) : (float16)(w.s12345678, w.s9abc, w.sde, w.sf, EMPTY);
+    float16 above = y > 0 ? load_quad(inv - size.pitch) : none;
+    float16 below = y + 1 < size.height ? load_quad(inv + size.pitch) : none;
+    float16 across = layered_least_step(w, left, right), down = layered_least_step(w, above, below);
+    return across > down ? across : down;
+}
+
+/* Weights of 16 slots in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), with two changes.
+ *
+ * Hidden slots may fall as gently as visible ones where the slot before them already stands in this layer or in front of
+ * it (has not begun to fall): there nothing shows through that a nearer surface hides.
+ *
+ * Slots of the interval before the layer are there to close the seam where a surface goes on into the layer and the
+ * blurred end of the layer before it lets through what is behind. The seam is as wide as the blur, so the rise is cut
+ * to that width: a surface that does not slope into the layer brings nothing, where the paper's full rise would widen
+ * its silhouette. */
+static inline float16 layered_weight(const __global float *inv, float16 w, float16 before, LayeredLayer layer, int peel,
+                                     LayeredSize size, int x, int y)
+{
+    const float16 zero = (float16)(0.0f), one = (float16)(1.0f);
+    float16 rising = w * layer.own.x + layer.own.y;
+    float16 falling = w * layer.own.z + layer.own.w;
+    float16 up = clamp01(rising), down = clamp01(falling);
+    float16 at_once = falling >= 1.0f ? one : zero;
+#if LAYERED_PAPER
+    down = peel > 0 ? at_once : down;
+#else
+    if (peel > 0) down = before * layer.own.z + layer.own.w >= 1.0f ? down : at_once;
+    float16 between = rising > 0.0f && rising < 1.0f ? one : zero;
+    if (sum16(between) > 0.0f) {
+        float16 part = layered_slope(inv, w, size, x, y) * (-layer.own.x * layer.reach);
+        part = part > 1.0f ? one : part;
+        part = part < 1e-3f ? (float16)(1e-3f) : part;
+        up = clamp01((rising - 1.0f) / part + 1.0f);
     }
-    float16 weight = clamp01(w * matting.x + matting.y) * down;
-    return w < 0.0f ? (float16)(0.0f) : weight;
+#endif
+    return w < 0.0f ? zero : up * down;
 }
 
 /* Four slots of a peel as the current run composes them. */
@@ -100,36 +163,57 @@ static inline float16 layered_color(float16 c, float4 w, int is_last)
     return c;
 }
 
-/* One layer (eq. 2) at the 16 pixels from x on, a multiple of 16: weighted slots, composed front to back.
- * `peels` has a bit for each peel that brings something to this tile. Returns whether there is anything. */
-static inline int layered_block(float16 quad[4], const __global float *color, const __global float *inv_depth,
-                                LayeredSize size, float4 matting, uint peels, int x, int y)
+#if LAYERED_GLASS && !LAYERED_PAPER
+/* Weights of four slots that are not opaque. An opaque slot may stand in several layers at full weight, since more of
+ * the same paint changes nothing; glass must not be counted twice. It is shared out between the layer whose interval it
+ * is in and the one before, so that both together let through exactly 1 - alpha: (1 - t) in front of
+ * t / (1 - (1 - t) * alpha), t being how far the slot is into its interval. */
+static inline float4 layered_glass(float4 weight, float4 alpha, float4 w, float4 before, LayeredLayer layer, int peel)
 {
-    int any = 0;
-    quad[0] = quad[1] = quad[2] = quad[3] = (float16)(0.0f);
+    float4 t = 1.0f - (w * layer.before.z + layer.before.w);
+    t = t > 1.0f ? (float4)(1.0f) : t;
+    if (peel > 0) t = before * layer.before.z + layer.before.w >= 1.0f ? t : (float4)(1.0f);
+    float4 rest = 1.0f - (1.0f - t) * alpha;
+    float4 rising = w * layer.own.x + layer.own.y, falling = w * layer.own.z + layer.own.w;
+    float4 glass = falling < 1.0f ? weight : t / (rest > 1e-3f ? rest : (float4)(1e-3f));
+    glass = rising >= 1.0f && w >= 0.0f ? glass : (float4)(0.0f);
+    return alpha < LAYERED_OPAQUE ? glass : weight;
+}
+#endif
+
+/* One layer (eq. 2) at the 16 pixels from x on, a multiple of 16: weighted slots, composed front to back.
+ * `peels` has a bit for each peel that brings something to this tile. */
+static inline void layered_block(float16 quad[4], const __global float *color, const __global float *inv_depth,
+                                 LayeredSize size, LayeredLayer layer, uint peels, int x, int y)
+{
     for (int m = 0; m < size.peels; m++) {
         if (!(peels >> m & 1u)) continue;
         const size_t row = (size_t)m * size.height + y;
         const __global float *inv = inv_depth + row * size.pitch + x;
         float16 w = load_quad(inv);
         float16 before = m > 0 ? load_quad(inv - (size_t)size.height * size.pitch) : w;
-        float16 weight = layered_weight(w, before, matting, m);
+        float16 weight = layered_weight(inv, w, before, layer, m, size, x, y);
         if (sum16(weight) <= 0.0f) continue;
-        any = 1;
         const __global float *rgba = color + (row * size.width + x) * 4;
-        const float4 weights[4] = {weight.s0123, weight.s4567, weight.s89ab, weight.scdef};
+        float4 weights[4] = {weight.s0123, weight.s4567, weight.s89ab, weight.scdef};
         const float4 inverse[4] = {w.s0123, w.s4567, w.s89ab, w.scdef};
+#if LAYERED_GLASS && !LAYERED_PAPER
+        const float4 inverse_before[4] = {before.s0123, before.s4567, before.s89ab, before.scdef};
+#endif
 #pragma unroll
         for (int q = 0; q < 4; q++) {
             int valid = size.width - x - 4 * q;
             if (valid <= 0) continue;
             float16 c = valid >= 4 ? load_quad(rgba + 16 * q) : load_quad_part(rgba + 16 * q, valid);
-            quad[q] = over(quad[q], layered_color(c, inverse[q], m == size.peels - 1) * spread(weights[q]));
+            c = layered_color(c, inverse[q], m == size.peels - 1);
+#if LAYERED_GLASS && !LAYERED_PAPER
+            weights[q] = layered_glass(weights[q], c.s37bf, inverse[q], inverse_before[q], layer, m);
+#endif
+            quad[q] = over(quad[q], c * spread(weights[q]));
         }
         /* Nothing shows through 16 opaque pixels: no need to read the peels behind them. */
         if (sum16((float16)(quad[0].s37bf, quad[1].s37bf, quad[2].s37bf, quad[3].s37bf)) >= 16.0f) break;
     }
-    return any;
 }
 
 /* Whether the quads at `line` are opaque in all rows: then there is no point in filtering what lies behind. */
@@ -220,7 +304,7 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
     const int y0 = ty * FIR_ROWS;
     const int segment_tiles = step.segment / LAYERED_TILE;
     const int tile0 = x0 / LAYERED_TILE - halo_tiles; /* state[0] */
-    const float4 layer_matting = matting.layer[step.layer];
+    const LayeredLayer own = layered_layer(&matting, step.layer);
     const __global uint *layer_peels = tile_peels + ((size_t)step.layer * size.tiles_y + ty) * size.tiles_x;
 
     /* What can be non-zero here, before touching any pixel. */
@@ -249,7 +333,7 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
         for (int i = 0; i < FIR_ROWS; i++, line += line_width * 4) {
             float16 layer[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
             if (is_here && y0 + i < size.height)
-                layered_block(layer, color, inv_depth, size, layer_matting, layer_peels[tx], x, y0 + i);
+                layered_block(layer, color, inv_depth, size, own, layer_peels[tx], x, y0 + i);
 #pragma unroll
             for (int q = 0; q < 4; q++) store_quad_local(line + 16 * q, layer[q]);
         }
@@ -353,7 +437,7 @@ __kernel void layered_resolve(__global float *restrict out, const __global float
     const int lid = get_local_id(0), items = get_local_size(0);
     const int tx = get_group_id(0), ty = get_group_id(1);
     const int x0 = tx * LAYERED_TILE, y0 = ty * FIR_ROWS;
-    const float4 layer_matting = matting.layer[resolve.layer];
+    const LayeredLayer own = layered_layer(&matting, resolve.layer);
     const uint peels = tile_peels[((size_t)resolve.layer * size.tiles_y + ty) * size.tiles_x + tx];
     const int has_front = layered_is_reached(front_reached, resolve.front, tx, ty, resolve.radius_front, size);
     const int has_back = layered_is_reached(back_reached, resolve.back, tx, ty, resolve.radius_back, size);
@@ -362,7 +446,7 @@ __kernel void layered_resolve(__global float *restrict out, const __global float
         int x = x0 + b % (LAYERED_TILE / 16) * 16, i = b / (LAYERED_TILE / 16);
         float16 layer[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
         if (peels && x < size.width && y0 + i < size.height)
-            layered_block(layer, color, inv_depth, size, layer_matting, peels, x, y0 + i);
+            layered_block(layer, color, inv_depth, size, own, peels, x, y0 + i);
 #pragma unroll
         for (int q = 0; q < 4; q++) store_quad_local(lines + 64 * b + 16 * q, layer[q]);
     }

@@ -22,11 +22,12 @@ class FrameShape(NamedTuple):
     width: int
     guard_px: int
     is_opaque: bool
+    has_glass: bool
 
     @classmethod
     def of(cls, frame: LayeredFrame) -> FrameShape:
         """The shape of a frame."""
-        return cls(frame.layer_count, frame.height, frame.width, frame.guard_px, frame.is_opaque)
+        return cls(frame.layer_count, frame.height, frame.width, frame.guard_px, frame.is_opaque, frame.has_glass)
 
     @property
     def pitch(self) -> int:

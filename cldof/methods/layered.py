@@ -5,13 +5,19 @@ and from the farthest one, layers are composed and blurred step by step towards 
 layer ``n`` steps from the focus is blurred by all ``n`` steps, in total ``sigma_n^2 = step_1^2 + ... + step_n^2`` with
 ``step_n = n * sigma_step`` (eqs. 14-15).
 
-Two things differ from the paper; docs/decisions.md gives the measurements.
+``matting="paper"`` uses the published matting functions. The default differs in four things, each measured in
+docs/decisions.md; kernels/layered.cl says how.
 
-- Ramps of the matting functions are linear in the CoC, not in z, so that they may reach beyond infinity.
 - Anchors stand at the CoC of their layer, not half-way to the next (eq. 9). Over the interval behind anchor k the weight
   in layer k falls from 1 to 0 in front of a full layer k+1, so what is seen passes from the blur of layer k to that of
   layer k+1; it is right at both ends only if the anchors are the layers' own CoC. In particular the plane in focus stays
-  untouched. ``anchors="midpoint"`` gives the paper's.
+  untouched.
+- A surface enters the next layer early only where it slopes into it, as far as the blur opens a seam. Entering every
+  layer a whole interval early widens silhouettes.
+- Hidden slots fall gently where no nearer surface would be covered.
+- Glass is shared out between two layers so that it lets through what its alpha says.
+
+Ramps are linear in the CoC, not in z, so that they may reach beyond infinity.
 """
 
 from __future__ import annotations
@@ -42,6 +48,9 @@ _TILE = 64
 # value, since a Gaussian of sigma 5e-4 px keeps all but exp(-2e6) of a pixel in place.
 _NEGLIGIBLE_COC_PX = 1e-3
 
+# A surface that slopes into a layer enters it this many sigma early, so that no seam opens between blurred layers.
+_SEAM_REACH = 2.0
+
 _SIZE = np.dtype([(name, np.int32) for name in ("width", "height", "pitch", "peels", "tiles_x", "tiles_y")])
 _STEP = np.dtype(
     [
@@ -55,7 +64,7 @@ _RESOLVE = np.dtype(
         for name in ("layer", "front", "back", "radius_front", "taps_front", "radius_back", "taps_back", "guard")
     ]
 )
-_MATTING = np.dtype([("layer", np.float32, (MAX_LAYERS, 4))])
+_MATTING = np.dtype([("layer", np.float32, (MAX_LAYERS, 4)), ("reach", np.float32, (MAX_LAYERS,))])
 
 
 class LayerStack(NamedTuple):
@@ -112,8 +121,8 @@ class Layered:
         give more layers and a better match; 1 is the paper's.
     cascade : bool
         False blurs every layer by itself (the paper's slower variant).
-    anchors : {"layer", "midpoint"}
-        Where matting intervals begin; see the module's text.
+    matting : {"seamless", "paper"}
+        Matting functions; see the module's text.
     engine : {"auto", "fir", "iir"}
         Gaussian engine; "auto" takes FIR for small sigma and the recursive one above, by device.
     """
@@ -121,7 +130,7 @@ class Layered:
     layers: int | None = None
     sigma_step: float = 1.0
     cascade: bool = True
-    anchors: str = "layer"
+    matting: str = "seamless"
     engine: str = "auto"
 
     name = "layered"
@@ -131,7 +140,7 @@ class Layered:
             raise InputError(f"layered: layers is {self.layers!r}; it must be a whole number from 3 to {MAX_LAYERS}.")
         if not (isinstance(self.sigma_step, int | float) and 0.1 <= self.sigma_step < math.inf):
             raise InputError(f"layered: sigma_step is {self.sigma_step!r}; it must be a number of at least 0.1 px.")
-        for name, choices in (("anchors", ("layer", "midpoint")), ("engine", ("auto", "fir", "iir"))):
+        for name, choices in (("matting", ("seamless", "paper")), ("engine", ("auto", "fir", "iir"))):
             if getattr(self, name) not in choices:
                 raise InputError(f"layered: {name} is {getattr(self, name)!r}; choose one of {', '.join(choices)}.")
 
@@ -145,7 +154,9 @@ class Layered:
         stack = self._stack(near_px, far_px)
         coc = layer_coc(stack)
         params = np.zeros((), _MATTING)
-        params["layer"][: stack.count] = matting_functions(coc, c1, c0, self.anchors)
+        params["layer"][: stack.count] = matting_functions(coc, c1, c0, self.matting)
+        sigma = GAUSSIAN_SIGMA * np.abs(coc)
+        params["reach"][1 : stack.count] = _SEAM_REACH * np.maximum(sigma[1:], sigma[:-1])
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},
@@ -170,17 +181,17 @@ class Layered:
         exponent = 0
         while True:
             step = self.sigma_step * 2.0 ** (exponent / 8)
-            front, back = (_layers_needed(px, step, self.anchors) for px in (near_px, far_px))
+            front, back = (_layers_needed(px, step, self.matting) for px in (near_px, far_px))
             if front + 1 + back <= most:
                 return LayerStack(front, back, step)
             exponent += 1
 
 
-def _layers_needed(largest_coc_px: float, step: float, anchors: str) -> int:
+def _layers_needed(largest_coc_px: float, step: float, matting: str) -> int:
     if largest_coc_px < _NEGLIGIBLE_COC_PX:
         return 0
     count = 1
-    while count < MAX_LAYERS and _side_coc(count, step)[-1 if anchors == "layer" else -2] < largest_coc_px:
+    while count < MAX_LAYERS and _side_coc(count, step)[-2 if matting == "paper" else -1] < largest_coc_px:
         count += 1
     return count
 
@@ -203,7 +214,7 @@ def layer_coc(stack: LayerStack) -> NDArray[np.float64]:
     return np.array([*front, *_side_coc(stack.back, stack.sigma_step)])
 
 
-def matting_functions(coc: NDArray[np.float64], c1: float, c0: float, anchors: str = "layer") -> NDArray[np.float64]:
+def matting_functions(coc: NDArray[np.float64], c1: float, c0: float, matting: str = "seamless") -> NDArray[np.float64]:
     """Matting functions as kernels/layered.cl takes them (Schedl & Wimmer 2012, eqs. 3-4).
 
     Parameters
@@ -212,7 +223,8 @@ def matting_functions(coc: NDArray[np.float64], c1: float, c0: float, anchors: s
         Signed CoC radius of each layer in px, rising.
     c1, c0 : float
         The lens: ``C = c1 / z + c0``.
-    anchors : {"layer", "midpoint"}
+    matting : {"seamless", "paper"}
+        Anchors at the layers' own CoC or half-way to the next (eq. 9).
 
     Returns
     -------
@@ -226,7 +238,7 @@ def matting_functions(coc: NDArray[np.float64], c1: float, c0: float, anchors: s
     # anchor[k + 2] is z_k as a CoC, for k = -2 .. K; beyond the layers they go on at the same distance.
     before, after = coc[0] - (coc[1] - coc[0]), coc[-1] + (coc[-1] - coc[-2])
     line = np.array([2 * before - coc[0], before, *coc, after])
-    anchor = line if anchors == "layer" else (line + np.append(line[1:], 2 * after - coc[-1])) / 2.0
+    anchor = line if matting == "seamless" else (line + np.append(line[1:], 2 * after - coc[-1])) / 2.0
     functions = np.empty((count, 4))
     for k in range(count):
         rise_from, rise_to, fall_from, fall_to = anchor[k : k + 4]
@@ -308,6 +320,8 @@ class _Builder:
             *self.blocking.defines,
             ("LAYERED_VOID", int(not self.shape.is_opaque)),
             ("LAYERED_ALPHA_RUN", int(alpha_run)),
+            ("LAYERED_GLASS", int(self.shape.has_glass)),
+            ("LAYERED_PAPER", int(self.method.matting == "paper")),
         )
         # The second run fills in the alpha of the image that the first one wrote.
         self.image = read_write("image") if alpha_run else write("image")

@@ -51,7 +51,7 @@ def twin(frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:
         stack.front,
         lambda k: gaussian.fir_taps(sigma(k)) if sigma(k) > 0 else np.ones(1),
         cascade=method.cascade,
-        kind=method.anchors,
+        paper=method.matting == "paper",
         opaque=frame.is_opaque,
         guard=frame.guard_px,
     )
@@ -70,7 +70,7 @@ def test_meets_the_oracle(device: Device, size: tuple[int, int], opaque: bool, c
     assert_close(render(device, frame, lens, **options), twin(frame, lens, **options), "layered")
 
 
-@pytest.mark.parametrize("options", [{"anchors": "midpoint"}, {"sigma_step": 0.4}, {"layers": 5}, {"layers": 3}])
+@pytest.mark.parametrize("options", [{"matting": "paper"}, {"sigma_step": 0.4}, {"layers": 5}, {"layers": 3}])
 def test_options_meet_the_oracle(device: Device, options: dict) -> None:
     frame = noise_frame(90, 70, guard_px=9)
     lens = Lens(10.0 / frame.camera.focal_px, 2.0)
@@ -212,7 +212,7 @@ def test_random_frames_keep_the_promises(
 
 def test_matting_weights_have_no_gap() -> None:
     """Whatever the CoC, some layer holds it fully; a gap would be a seam."""
-    for kind in ("layer", "midpoint"):
+    for kind in ("seamless", "paper"):
         coc = layer_coc(LayerStack(5, 4, 1.0))
         functions = matting_functions(coc, -30.0, 10.0, kind)
         w = np.linspace(0.0, 2.0, 20001)
@@ -251,7 +251,7 @@ def test_an_enormous_aperture_is_planned_and_rendered(device: Device) -> None:
         ({"layers": 2}, "layers is 2"),
         ({"layers": 33}, "from 3 to 32"),
         ({"sigma_step": 0.0}, "sigma_step"),
-        ({"anchors": "paper"}, "choose one of layer, midpoint"),
+        ({"matting": "soft"}, "choose one of seamless, paper"),
         ({"engine": "box"}, "choose one of auto, fir, iir"),
     ],
 )

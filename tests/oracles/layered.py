@@ -14,46 +14,87 @@ def over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
 class Anchors:
     """z_k as a CoC, for k = -2 .. K."""
 
-    def __init__(self, coc: np.ndarray, kind: str) -> None:
-        self.count = len(coc)
-        first, last = coc[1] - coc[0], coc[-1] - coc[-2]
-        self._coc = lambda k: (
-            coc[k] if 0 <= k < self.count else coc[0] + k * first if k < 0 else coc[-1] + (k - self.count + 1) * last
-        )
-        self._kind = kind
+    def __init__(self, coc: np.ndarray, midpoint: bool) -> None:
+        self._coc, self._midpoint = coc, midpoint
 
     def __getitem__(self, k: int) -> float:
-        if self._kind == "layer":
-            return self._coc(k)
-        return 0.5 * (self._coc(k) + self._coc(k + 1))  # eq. 9
+        if self._midpoint:
+            return 0.5 * (self._layer(k) + self._layer(k + 1))  # eq. 9
+        return self._layer(k)
+
+    def _layer(self, k: int) -> float:
+        coc, count = self._coc, len(self._coc)
+        if k < 0:
+            return coc[0] + k * (coc[1] - coc[0])
+        if k >= count:
+            return coc[-1] + (k - count + 1) * (coc[-1] - coc[-2])
+        return coc[k]
 
 
-def weights(coc: np.ndarray, layers: np.ndarray, kind: str = "layer") -> np.ndarray:
+def slope(coc: np.ndarray) -> np.ndarray:
+    """Change of the CoC from pixel to pixel: the lesser of two sides, the greater of two directions; (M, H, W)."""
+    steps = []
+    for axis in (1, 2):
+        step = np.abs(np.diff(coc, axis=axis))
+        ahead, behind = np.full_like(coc, np.nan), np.full_like(coc, np.nan)
+        at = [slice(None)] * 3
+        at[axis] = slice(None, -1)
+        ahead[tuple(at)] = step
+        at[axis] = slice(1, None)
+        behind[tuple(at)] = step
+        steps.append(np.nan_to_num(np.fmin(ahead, behind)))
+    return np.maximum(*steps)
+
+
+def weights(coc: np.ndarray, alpha: np.ndarray, layers: np.ndarray, paper: bool) -> np.ndarray:
     """Weight of every slot in every layer.
 
     Parameters
     ----------
-    coc : (M, H, W)
-        Signed CoC radius of each slot, NaN for slots with nothing in them.
+    coc, alpha : (M, H, W)
+        Signed CoC radius of each slot, NaN for slots with nothing in them; its alpha.
     layers : (K,)
         CoC of each layer.
+
+    Returns
+    -------
+    (K, M, H, W)
     """
     count = len(layers)
     result = np.zeros((count, *coc.shape))
     if count == 1:
         result[0] = ~np.isnan(coc)
         return result
-    z = Anchors(layers, kind)
+    z = Anchors(layers, midpoint=paper)
+    steps = slope(coc)
+    sigma = np.abs(layers) / 2.0
     for k in range(count):
+        rise_width, fall_width = z[k - 1] - z[k - 2], z[k + 1] - z[k]
+        seam = 2.0 * max(sigma[k], sigma[k - 1]) if k else 0.0
         for m in range(len(coc)):
             c = coc[m]
-            with np.errstate(invalid="ignore"):
-                rise = np.ones_like(c) if k == 0 else np.clip((c - z[k - 2]) / (z[k - 1] - z[k - 2]), 0, 1)
-                fall = np.ones_like(c) if k == count - 1 else np.clip((z[k + 1] - c) / (z[k + 1] - z[k]), 0, 1)
-                if m > 0 and k < count - 1:
-                    before_is_in_layer = coc[m - 1] <= z[k]
-                    fall = np.where(before_is_in_layer, fall, (c <= z[k]).astype(float))
-                result[k, m] = np.where(np.isnan(c), 0.0, rise * fall)
+            before = coc[m - 1] if m else np.full_like(c, -np.inf)
+            rising = np.full_like(c, np.inf) if k == 0 else (c - z[k - 2]) / rise_width
+            falling = np.full_like(c, np.inf) if k == count - 1 else (z[k + 1] - c) / fall_width
+            fall = np.clip(falling, 0, 1)
+            if paper:
+                rise = np.clip(rising, 0, 1)
+                if m:
+                    fall = (falling >= 1).astype(float)
+            else:
+                part = np.clip(steps[m] / rise_width * seam, 1e-3, 1.0)
+                rise = np.where(rising >= 1, 1.0, np.clip(1.0 + (rising - 1.0) / part, 0, 1))
+                may_fall = np.full(c.shape, k == count - 1) | (before <= z[k])
+                fall = np.where(may_fall, fall, (falling >= 1).astype(float))
+            weight = rise * fall
+            if not paper:
+                into = np.ones_like(c)  # how far the slot is into the layer's own interval
+                if k > 0:
+                    into = np.where(before <= z[k - 1], np.clip((c - z[k - 1]) / (z[k] - z[k - 1]), -np.inf, 1), 1.0)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    shared = np.where(falling < 1, weight, into / np.maximum(1 - (1 - into) * alpha[m], 1e-3))
+                weight = np.where(alpha[m] < 0.998, np.where(rising >= 1, shared, 0.0), weight)
+            result[k, m] = np.where(np.isnan(c), 0.0, weight)
     return result
 
 
@@ -75,7 +116,7 @@ def render(
     taps_of: Callable[[int], np.ndarray],
     *,
     cascade: bool = True,
-    kind: str = "layer",
+    paper: bool = False,
     opaque: bool = True,
     guard: int = 0,
 ) -> np.ndarray:
@@ -95,7 +136,7 @@ def render(
     coc = c1 / depth.astype(np.float64) + c0
     if opaque:
         coc[nothing] = np.nan
-        image = _compose(color, coc, layers, focus, taps_of, cascade, kind)
+        image = _compose(color, coc, layers, focus, taps_of, cascade, paper)
         alpha = None
     else:
         covered, surfaces = color.copy(), np.zeros_like(color)
@@ -103,8 +144,8 @@ def render(
         covered[-1, ..., 3] = 1.0  # the void behind the last slot stands at its depth
         surfaces[..., 0] = color[..., 3]
         surfaces[..., 3] = covered[..., 3]
-        image = _compose(covered, coc, layers, focus, taps_of, cascade, kind)
-        alpha = _compose(surfaces, coc, layers, focus, taps_of, cascade, kind)
+        image = _compose(covered, coc, layers, focus, taps_of, cascade, paper)
+        alpha = _compose(surfaces, coc, layers, focus, taps_of, cascade, paper)
     coverage = image[..., 3:]
     known = coverage > 1e-4
     safe = np.where(known, coverage, 1.0)
@@ -122,9 +163,9 @@ def _compose(
     focus: int,
     taps_of: Callable[[int], np.ndarray],
     cascade: bool,
-    kind: str,
+    paper: bool,
 ) -> np.ndarray:
-    weight = weights(coc, layers, kind)
+    weight = weights(coc, color[..., 3], layers, paper)
     parts = [compose_layer(color, weight[k]) for k in range(len(layers))]
     if not cascade:
         image = np.zeros(color.shape[1:])
