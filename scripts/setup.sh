@@ -27,6 +27,7 @@ as_root() {
 apt_updated=
 apt_install() {
     command -v apt-get >/dev/null || return 1
+    as_root true 2>/dev/null || return 1
     if [ -z "$apt_updated" ]; then
         as_root apt-get update -qq >&2 || say "apt-get update failed; trying with the package lists at hand"
         apt_updated=1
@@ -74,12 +75,12 @@ if [ ! -e "$stamp" ] || [ setup.cfg -nt "$stamp" ] || [ pyproject.toml -nt "$sta
     target=.
     [ "$extra" = core ] || target=".[$extra]"
     say "installing cldof and what it needs into $venv (once, a few minutes on a slow line)"
-    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e "$target"
+    "$venv/bin/python" -m pip install -qq --disable-pip-version-check -e "$target"
     touch "$stamp"
 fi
 
 # Proved by use, not by looking for files: a vendor's driver counts as well. Drivers may be talkative while they fail.
-prove() { ( "$venv/bin/python" -c "$1" ) >"$venv/$2.log" 2>&1; }
+prove() { { "$venv/bin/python" -c "$1" >"$venv/$2.log" 2>&1; } 2>/dev/null; }
 have_cl() { prove 'from cldof.host.device import Device; Device.open().traits' cl; }
 have_gl() { prove 'from cldof.capture.peel import DepthPeeler; DepthPeeler(8, 8).close()' gl; }
 why() { tail -n 1 "$venv/$1.log"; }
@@ -99,7 +100,7 @@ if [ ! -e "$gl_stamp" ]; then
     if have_gl || { apt_install libegl1 libgl1 libgl1-mesa-dri && have_gl; }; then
         touch "$gl_stamp"
     else
-        say "no offscreen OpenGL here ($(why gl)): scenes cannot be captured;" \
-            "install libegl1 libgl1 libgl1-mesa-dri. Frames of your own (.npz, arrays) still render."
+        say "no offscreen OpenGL here: scenes cannot be captured; frames of your own (.npz, arrays) still render." \
+            "The probe ended with: $(why gl)"
     fi
 fi
