@@ -24,7 +24,7 @@ from .methods import FrameShape, Plan, make_method
 
 __all__ = ["PendingResult", "Renderer", "Result"]
 
-# Pass lists kept for the most recent kinds of frame (shape and plan structure); their memory is shared through the pool.
+# Pass lists kept for the most recent kinds of frame (shape and plan structure); the pool passes their memory on.
 _KEPT_PROGRAMS = 4
 # Inverse depth of a slot with nothing in it, as kernels/common.clh has it.
 _EMPTY = -1.0
@@ -274,22 +274,15 @@ class Renderer:
         return preparation
 
     def _ring(self, shape: FrameShape, plan: Plan) -> FrameRing:
-        return _cached(
-            self._rings,
-            (shape, plan.structure),
-            lambda: FrameRing(self.method.program(shape, plan, self.device.traits), self.device, self._slots),
-        )
-
-
-def _cached(cache: OrderedDict[Any, Any], key: Any, make: Any) -> Any:
-    """Look up or make, keeping the most recently used few."""
-    if key in cache:
-        cache.move_to_end(key)
-    else:
-        while len(cache) >= _KEPT_PROGRAMS:
-            cache.popitem(last=False)[1].close()
-        cache[key] = make()
-    return cache[key]
+        key = (shape, plan.structure)
+        ring = self._rings.get(key)
+        if ring is None:
+            while len(self._rings) >= _KEPT_PROGRAMS:
+                self._rings.popitem(last=False)[1].close()
+            ring = FrameRing(self.method.program(shape, plan, self.device.traits), self.device, self._slots)
+            self._rings[key] = ring
+        self._rings.move_to_end(key)
+        return ring
 
 
 def _inverse_depth_program(shape: FrameShape) -> FrameProgram:

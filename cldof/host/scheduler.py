@@ -185,6 +185,12 @@ class Batch:
         """
         self._users.append(event)
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether the last submission, and everything held for, is over."""
+        events = self._users if self._last is None else [self._last, *self._users]
+        return all(event.command_execution_status <= _COMPLETE for event in events)
+
     def output(self, name: str) -> Any:
         """Buffer of an OUTPUT.
 
@@ -343,30 +349,25 @@ class Batch:
 
 
 class FrameRing:
-    """Several batches of one frame program, taken in turn, so that frames can overlap.
+    """Several batches of one frame program, so that frames can overlap.
 
-    Each has transients and outputs of its own. When a turn comes round again the new frame waits for the old one on the
-    device, not on the host.
+    Each has transients and outputs of its own and is made when it is first needed: frames that never overlap share one.
+    When all are busy the new frame waits for the one that was started longest ago, on the device and not on the host.
 
     Parameters
     ----------
     program : FrameProgram
     device : Device
     slots : int
-        Frames in flight.
+        The most frames in flight.
     """
 
     def __init__(self, program: FrameProgram, device: Device, slots: int = 2) -> None:
         if slots < 1:
             raise InputError(f"a frame ring of {slots} slots was asked for; it needs at least 1")
-        self.batches: list[Batch] = []
-        self._turn = 0
-        try:
-            for _ in range(slots):
-                self.batches.append(compile(program, device))
-        except BaseException:
-            self.close()
-            raise
+        self._slots = slots
+        # In the order of their last submission.
+        self.batches: deque[Batch] = deque([compile(program, device)])
 
     def submit(
         self,
@@ -374,9 +375,14 @@ class FrameRing:
         params: Mapping[str, Any] | None = None,
         wait_for: Sequence[Any] = (),
     ) -> Submission:
-        """As :meth:`Batch.submit`, on the next batch; its outputs are ``submission.batch.output(name)``."""
-        batch = self.batches[self._turn]
-        self._turn = (self._turn + 1) % len(self.batches)
+        """As :meth:`Batch.submit`, on a free batch; its outputs are ``submission.batch.output(name)``."""
+        batch = next((batch for batch in self.batches if batch.is_idle), None)
+        if batch is None and len(self.batches) < self._slots:
+            batch = compile(self.batches[0].program, self.batches[0].device)
+            self.batches.append(batch)
+        batch = batch or self.batches[0]
+        self.batches.remove(batch)
+        self.batches.append(batch)
         return batch.submit(inputs, params, wait_for)
 
     def close(self) -> None:

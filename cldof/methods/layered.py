@@ -8,10 +8,10 @@ layer ``n`` steps from the focus is blurred by all ``n`` steps, in total ``sigma
 ``matting="paper"`` uses the published matting functions. The default differs in four things, each measured in
 docs/decisions.md; kernels/layered.cl says how.
 
-- Anchors stand at the CoC of their layer, not half-way to the next (eq. 9). Over the interval behind anchor k the weight
-  in layer k falls from 1 to 0 in front of a full layer k+1, so what is seen passes from the blur of layer k to that of
-  layer k+1; it is right at both ends only if the anchors are the layers' own CoC. In particular the plane in focus stays
-  untouched.
+- Anchors stand at the CoC of their layer, not half-way to the next (eq. 9). Over the interval behind anchor k the
+  weight in layer k falls from 1 to 0 in front of a full layer k+1, so what is seen passes from the blur of layer k to
+  that of layer k+1; it is right at both ends only if the anchors are the layers' own CoC. In particular the plane in
+  focus stays untouched.
 - A surface enters the next layer early only where it slopes into it, as far as the blur opens a seam. Entering every
   layer a whole interval early widens silhouettes.
 - Hidden slots fall gently where no nearer surface would be covered.
@@ -38,7 +38,7 @@ from ..lens import GAUSSIAN_SIGMA, Lens
 from . import gaussian
 from .base import FrameShape, Plan
 
-__all__ = ["MAX_LAYERS", "Layered", "LayerStack", "matting_functions"]
+__all__ = ["MAX_LAYERS", "LayerStack", "Layered", "matting_functions"]
 
 # Constants of kernels/layered.cl.
 MAX_LAYERS = 32
@@ -75,7 +75,7 @@ class LayerStack(NamedTuple):
     sigma_step: float
 
     @property
-    def count(self) -> int:
+    def total(self) -> int:
         """K."""
         return self.front + 1 + self.back
 
@@ -154,13 +154,13 @@ class Layered:
         stack = self._stack(near_px, far_px)
         coc = layer_coc(stack)
         params = np.zeros((), _MATTING)
-        params["layer"][: stack.count] = matting_functions(coc, c1, c0, self.matting)
+        params["layer"][: stack.total] = matting_functions(coc, c1, c0, self.matting)
         sigma = GAUSSIAN_SIGMA * np.abs(coc)
-        params["reach"][1 : stack.count] = _SEAM_REACH * np.maximum(sigma[1:], sigma[:-1])
+        params["reach"][1 : stack.total] = _SEAM_REACH * np.maximum(sigma[1:], sigma[:-1])
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},
-            "layers": stack.count,
+            "layers": stack.total,
             "focus_layer": stack.front,
             "sigma_step": stack.sigma_step,
             "largest_near_coc_px": near_px,
@@ -297,7 +297,7 @@ class _Builder:
             Buffer("color", shape.layers * self.pixels * 16, Role.INPUT),
             Buffer("inv_depth", shape.layers * shape.height * shape.pitch * 4, Role.INPUT),
             Buffer("image", math.prod(shape.output_size) * 16, Role.OUTPUT),
-            Buffer("tile_peels", stack.count * self.tiles_x * self.tiles_y * 4),
+            Buffer("tile_peels", stack.total * self.tiles_x * self.tiles_y * 4),
         ]
         self.passes: list[Pass] = []
         # What kernels are handed where there is no image to read yet.
@@ -330,13 +330,13 @@ class _Builder:
         if self.method.cascade:
             focus = self.stack.front
             front = self._cascade(f"{run}_front", range(focus), in_front=True)
-            back = self._cascade(f"{run}_back", range(self.stack.count - 1, focus, -1), in_front=False)
+            back = self._cascade(f"{run}_back", range(self.stack.total - 1, focus, -1), in_front=False)
             self._resolve(front, back)
         else:
             self._each_by_itself(run)
 
     def _classify(self) -> None:
-        count = self.stack.count
+        count = self.stack.total
         self._add(
             "layered_classify",
             (write("tile_peels"), read("inv_depth"), self.size, np.int32(count), Param("matting", _MATTING)),
@@ -355,7 +355,7 @@ class _Builder:
         composed = f"{run}_composed"
         self._image_buffer(composed)
         sigmas = GAUSSIAN_SIGMA * np.abs(layer_coc(self.stack))
-        for layer in range(self.stack.count):
+        for layer in range(self.stack.total):
             image = self._step(f"{run}_layer_{layer}", layer, self.nothing, True, float(sigmas[layer]))
             radius, centre = self.taps.centre(image.sigma)
             self._add(

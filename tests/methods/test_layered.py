@@ -234,14 +234,14 @@ def test_few_layers_take_larger_steps() -> None:
     frame = noise_frame(40, 30)
     lens = Lens(40.0 / frame.camera.focal_px, 1.7)
     few, many = (Layered(layers=n).plan(frame, lens).structure for n in (5, 20))
-    assert few.count <= 5 < many.count <= 20
+    assert few.total <= 5 < many.total <= 20
     assert few.sigma_step > many.sigma_step >= 1.0
 
 
 def test_an_enormous_aperture_is_planned_and_rendered(device: Device) -> None:
     frame = noise_frame(50, 40)
     lens = Lens(5000.0 / frame.camera.focal_px, 1.7)
-    assert Layered().plan(frame, lens).structure.count <= MAX_LAYERS
+    assert Layered().plan(frame, lens).structure.total <= MAX_LAYERS
     assert np.isfinite(render(device, frame, lens)).all()
 
 
