@@ -129,6 +129,10 @@ class Camera:
         yfov = math.degrees(2.0 * math.atan(height / (2.0 * self.focal_px)))
         return replace(self, width=self.width + 2 * guard_px, height=height, yfov_deg=yfov)
 
+    def supersampled(self, factor: int) -> Camera:
+        """The same view with ``factor`` times as many pixels each way."""
+        return replace(self, width=self.width * factor, height=self.height * factor)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, as a camera file holds them."""
         return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
 
@@ -26,6 +26,9 @@ __all__ = ["PendingResult", "Renderer", "Result"]
 
 # Pass lists kept for the most recent kinds of frame (shape and plan structure); the pool passes their memory on.
 _KEPT_PROGRAMS = 4
+_MAX_SUPERSAMPLE = 8
+# Pixels an item of frame_box makes, as kernels/frame.cl has it.
+_BOX_RUN = 16
 # Inverse depth of a slot with nothing in it, as kernels/common.clh has it.
 _EMPTY = -1.0
 
@@ -116,6 +119,9 @@ class Renderer:
         Use an out-of-order queue where the device has one.
     frames_in_flight : int
         How many frames may overlap with :meth:`render_async`; each has buffers of its own.
+    supersample : int
+        Frames come in captured this many times larger than the image, and the image is box-filtered down after the
+        blur: edges in focus become smooth, at about the square of the cost.
     **options
         The method's, for instance ``layers=12`` (:class:`cldof.methods.layered.Layered`).
 
@@ -137,11 +143,14 @@ class Renderer:
         profile: bool = False,
         out_of_order: bool = False,
         frames_in_flight: int = 2,
+        supersample: int = 1,
         **options: Any,
     ) -> None:
         self.method = make_method(method, **options)
         if frames_in_flight < 1:
             raise InputError(f"frames_in_flight is {frames_in_flight}; it must be at least 1.")
+        if not (isinstance(supersample, int) and 1 <= supersample <= _MAX_SUPERSAMPLE):
+            raise InputError(f"supersample is {supersample!r}; it must be a whole number, 1 to {_MAX_SUPERSAMPLE}.")
         if context is not None or queue is not None:
             if device is not None:
                 raise InputError("Give a device, or a context or queue of your own, not both.")
@@ -149,6 +158,7 @@ class Renderer:
         else:
             self.device = Device.open(device, profiling=profile, out_of_order=out_of_order)
         self._slots = frames_in_flight
+        self._supersample = supersample
         self._lock = threading.Lock()
         self._rings: OrderedDict[Any, FrameRing] = OrderedDict()
         # Recent frames by identity; holding the frame keeps the identity from being used again.
@@ -191,7 +201,7 @@ class Renderer:
                 f"render takes a LayeredFrame and a Lens; got {type(frame).__name__}, {type(lens).__name__}."
             )
         shape = FrameShape.of(frame)
-        image = _output_array(out, (*shape.output_size, 4))
+        image = _output_array(out, (*self._image_size(shape), 4))
         with self._lock:
             if self._closed:
                 raise DeviceError("This renderer is closed; make a new one.")
@@ -204,7 +214,8 @@ class Renderer:
                 [*held.color.waits, held.ready],
             )
             held.last_use = submission.event
-            download = self.device.pool.download(submission.batch.output("image"), image, [submission.event])
+            output = "image" if self._supersample == 1 else "resolved"
+            download = self.device.pool.download(submission.batch.output(output), image, [submission.event])
             submission.batch.hold(download)
         return PendingResult(submission, download, image, plan, started, self.device.is_profiling)
 
@@ -239,6 +250,16 @@ class Renderer:
         except CldofError:
             if error is None:
                 raise
+
+    def _image_size(self, shape: FrameShape) -> tuple[int, int]:
+        factor = self._supersample
+        height, width = shape.output_size
+        if height % factor or width % factor:
+            raise InputError(
+                f"The frame's camera is {width}x{height}, which supersample={factor} does not divide; capture it "
+                f"with a camera of {factor} times the image's size."
+            )
+        return height // factor, width // factor
 
     def _upload(self, frame: LayeredFrame, shape: FrameShape) -> _DeviceFrame:
         """The frame's inputs, from the last calls or made now: colour, and inverse depth in padded rows."""
@@ -279,7 +300,10 @@ class Renderer:
         if ring is None:
             while len(self._rings) >= _KEPT_PROGRAMS:
                 self._rings.popitem(last=False)[1].close()
-            ring = FrameRing(self.method.program(shape, plan, self.device.traits), self.device, self._slots)
+            program = self.method.program(shape, plan, self.device.traits)
+            if self._supersample > 1:
+                program = _resolved(program, self._image_size(shape), self._supersample)
+            ring = FrameRing(program, self.device, self._slots)
             self._rings[key] = ring
         self._rings.move_to_end(key)
         return ring
@@ -313,6 +337,21 @@ def _inverse_depth_program(shape: FrameShape) -> FrameProgram:
             )
         ],
     )
+
+
+def _resolved(program: FrameProgram, size: tuple[int, int], factor: int) -> FrameProgram:
+    """Append the box filter to a method's passes."""
+    height, width = size
+    buffers = [replace(b, role=Role.TRANSIENT) if b.name == "image" else b for b in program.buffers.values()]
+    buffers.append(Buffer("resolved", height * width * 16, Role.OUTPUT))
+    box = Pass(
+        "frame",
+        "frame_box",
+        (write("resolved"), read("image"), np.int32(width), np.int32(height), np.int32(factor)),
+        (-(-width // _BOX_RUN), height),
+        traffic_bytes=height * width * 16 * (factor**2 + 1),
+    )
+    return FrameProgram.of(buffers, [*program.passes, box])
 
 
 def _output_array(out: NDArray[np.float32] | None, shape: tuple[int, ...]) -> NDArray[np.float32]:

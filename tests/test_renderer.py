@@ -169,3 +169,24 @@ def test_bad_arguments(device_info: DeviceInfo) -> None:
         Renderer(device="no such gadget")
     with pytest.raises(InputError, match="not both"):
         Renderer(device=0, queue=object())
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+@pytest.mark.parametrize("opaque", [True, False])
+def test_supersampling_is_a_box_filter_after_the_blur(device_info: DeviceInfo, factor: int, opaque: bool) -> None:
+    frame = noise_frame(37 * factor, 20 * factor, opaque=opaque, guard_px=4)
+    lens = lens_for(frame)
+    with Renderer(device=device_info.index) as renderer:
+        full = renderer.render(frame, lens).image
+    with Renderer(device=device_info.index, supersample=factor) as renderer:
+        image = renderer.render(frame, lens).image
+    expected = full.reshape(20, factor, 37, factor, 4).mean(axis=(1, 3), dtype=np.float64)
+    np.testing.assert_allclose(image, expected, atol=1e-6)
+
+
+def test_supersampling_needs_a_size_that_divides(device_info: DeviceInfo) -> None:
+    frame = noise_frame(21, 20)
+    with Renderer(device=device_info.index, supersample=2) as renderer, pytest.raises(InputError, match="21x20"):
+        renderer.render(frame, lens_for(frame))
+    with pytest.raises(InputError, match="supersample is 0"):
+        Renderer(device=device_info.index, supersample=0)

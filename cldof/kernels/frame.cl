@@ -21,3 +21,25 @@ __kernel void frame_inverse_depth(__global float *restrict inv_depth, const __gl
     }
     for (int x = width; x < pitch; x++) w[x] = EMPTY;
 }
+
+/* frame_box: mean of blocks of pixels, the resolve of a supersampled image.
+ * reads   image  float[factor * height][factor * width][4]
+ * writes  out    float[height][width][4]
+ * range   2-D, one item per FRAME_BOX_RUN pixels of a row of out, any local size */
+#define FRAME_BOX_RUN 16
+__kernel void frame_box(__global float *restrict out, const __global float *restrict image, int width, int height,
+                        int factor)
+{
+    const int x0 = FRAME_BOX_RUN * (int)get_global_id(0), y = get_global_id(1);
+    if (y >= height) return;
+    const int x1 = x0 + FRAME_BOX_RUN < width ? x0 + FRAME_BOX_RUN : width;
+    const size_t stride = (size_t)factor * width * 4;
+    const float scale = 1.0f / (float)(factor * factor);
+    for (int x = x0; x < x1; x++) {
+        const __global float *block = image + (size_t)y * factor * stride + (size_t)x * factor * 4;
+        float4 sum = (float4)(0.0f);
+        for (int j = 0; j < factor; j++)
+            for (int i = 0; i < factor; i++) sum += load_pixel(block + j * stride + i * 4);
+        store_pixel(out + ((size_t)y * width + x) * 4, sum * scale);
+    }
+}

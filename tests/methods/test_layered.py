@@ -153,6 +153,36 @@ def test_an_opaque_plane_stays_opaque(device: Device, degrees: float) -> None:
     np.testing.assert_allclose(out, 1.0, atol=1e-5)
 
 
+@pytest.mark.parametrize(("degrees", "darkest"), [(45.0, 0.998), (80.0, 0.99), (85.0, 0.98)])
+def test_a_slope_lets_little_through_to_what_is_behind(device: Device, degrees: float, darkest: float) -> None:
+    """White through focus before a black sky: where one blurred layer hands over to the next, a seam would be dark."""
+    camera = Camera(128, 96, 40.0)
+    y = (np.arange(96) + 0.5 - 48) / camera.focal_px
+    inverse = np.clip((1.0 - math.tan(math.radians(degrees)) * y) / 2.0, 0.02, 4.0)
+    depth = np.full((2, 96, 128), np.inf, np.float32)
+    depth[0] = 1.0 / inverse[:, None]
+    color = np.ones((2, 96, 128, 4), np.float32)
+    color[1, ..., :3] = 0.0
+    out = render(device, LayeredFrame(color, depth, camera), Lens(6.0 / camera.focal_px, 2.0))
+    assert out[..., :3].min() > darkest
+
+
+@pytest.mark.parametrize("depth", [1.2, 1.99, 2.0, 2.4, 9.0])
+@pytest.mark.parametrize("alpha", [1 / 255, 0.15, 0.5, 0.9, 0.99])
+@pytest.mark.parametrize("opaque", [True, False], ids=["wall", "void"])
+def test_glass_lets_through_what_its_alpha_says(device: Device, depth: float, alpha: float, opaque: bool) -> None:
+    """A pane that fills the view, wherever it is between the layers, before a wall or before nothing."""
+    color = np.zeros((2, 24, 40, 4), np.float32)
+    color[0] = np.float32((0.1, 0.5, 0.2, 1.0)) * np.float32(alpha)
+    z = np.full((2, 24, 40), np.inf, np.float32)
+    z[0] = depth
+    if opaque:
+        color[1], z[1] = (0.9, 0.3, 4.0, 1.0), 20.0
+    frame = LayeredFrame(color, z, Camera(40, 24, 40.0))
+    out = render(device, frame, Lens(14.0 / frame.camera.focal_px, 2.0))
+    np.testing.assert_allclose(out, frame.pinhole_image(), atol=2e-5, rtol=2e-5)
+
+
 def test_mirror_symmetry(device: Device) -> None:
     frame = noise_frame(128, 64, seed=5)
     mirrored = LayeredFrame(frame.color[:, ::-1, ::-1], frame.depth[:, ::-1, ::-1], frame.camera)
