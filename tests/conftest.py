@@ -7,6 +7,7 @@ writes outside its buffers, or counts on zeros, fails here without any effort in
 
 from __future__ import annotations
 
+import atexit
 import os
 import tempfile
 from collections.abc import Callable, Iterator
@@ -61,6 +62,8 @@ def _claim_pocl_cache() -> IO[str] | None:
 
 # Before anything imports pyopencl. The variables also reach subprocesses.
 _pocl_cache_lock = _claim_pocl_cache()
+if _pocl_cache_lock is not None:
+    atexit.register(_pocl_cache_lock.close)
 os.environ["CLDOF_CACHE_DIR"] = str(Path(os.environ["POCL_CACHE_DIR"]) / "cldof")
 
 

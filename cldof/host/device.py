@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -194,6 +195,12 @@ class Device:
         infos = [_info(index, device) for index, device in enumerate(devices)]
         index = _choose(infos, choice if choice is not None else os.environ.get(ENVIRONMENT_VARIABLE) or None)
         device = devices[index]
+        needs_linker = Effect.NEEDS_LINKER in effects_of(infos[index].platform, infos[index].name)
+        if needs_linker and shutil.which("ld") is None:
+            raise DeviceError(
+                f"device {infos[index]} links kernels with the system linker `ld`, which is not on the PATH. Install "
+                "it (Debian and Ubuntu: apt-get install gcc libc6-dev)."
+            )
         try:
             context = cl.Context([device])
             queue = _new_queue(context, device, profiling, out_of_order)

@@ -15,6 +15,7 @@ class Effect(Enum):
     """What the library does differently."""
 
     DRIVER_CACHES_BUILDS = "the driver keeps built programs on disk; ours would only be a second copy"
+    NEEDS_LINKER = "needs the system linker for every build, and ends the whole process where there is none"
     LAST_RESORT = "chosen only by name or index, or when there is nothing else"
 
 
@@ -61,6 +62,14 @@ QUIRKS = (
         effect=Effect.DRIVER_CACHES_BUILDS,
         reason="the driver has a compute cache (CUDA_CACHE_PATH)",
         source="pyopencl.characterize.has_src_build_cache, pyopencl 2026.1; not tried here",
+        date="2026-11-23",
+    ),
+    Quirk(
+        platform="portable computing language",
+        device="",
+        effect=Effect.NEEDS_LINKER,
+        reason="kernels are linked with `ld` against libgcc and libc; PoCL calls abort() when that fails",
+        source="seen with pip's PoCL 3.0 in a bare Debian 12",
         date="2026-11-23",
     ),
     Quirk(

@@ -123,3 +123,11 @@ def test_close_may_come_before_the_batch_is_closed(device_info: DeviceInfo, kern
     batch.close()
     with pytest.raises(DeviceError, match="closed"):
         device.pool.acquire(1)
+
+
+def test_a_missing_linker_is_said_before_pocl_aborts(monkeypatch: pytest.MonkeyPatch, device_info: DeviceInfo) -> None:
+    if "Portable Computing Language" not in device_info.platform:
+        pytest.skip("only PoCL links with ld")
+    monkeypatch.setenv("PATH", "/nonexistent")
+    with pytest.raises(DeviceError, match="apt-get install gcc libc6-dev"):
+        Device.open(device_info.index)
