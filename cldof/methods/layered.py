@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,6 +51,12 @@ _NEGLIGIBLE_COC_PX = 1e-3
 
 # A surface that slopes into a layer enters it this many sigma early, so that no seam opens between blurred layers.
 _SEAM_REACH = 2.0
+
+# Steps of the cascade when none is given: 1 px, or less until the side with more blur has so many layers, but no less
+# than 2^(-12/8) = 0.35 px. Fewer layers cost quality, finer steps are below what pixels can show.
+_STEPS_PER_OCTAVE = 8
+_USUAL_LAYERS_A_SIDE = 6
+_FINEST_STEP = 12
 
 _SIZE = np.dtype([(name, np.int32) for name in ("width", "height", "pitch", "peels", "tiles_x", "tiles_y")])
 _STEP = np.dtype(
@@ -116,9 +123,10 @@ class Layered:
     ----------
     layers : int, optional
         The most depth layers K to use, 3 to 32. Steps grow when the CoC range asks for more. None: up to 32.
-    sigma_step : float
+    sigma_step : float, optional
         Step of the cascade in px: the blur grows by ``n * sigma_step`` at the n-th layer from the focus. Smaller steps
-        give more layers and a better match; 1 is the paper's.
+        give more layers and as a rule a better match; 1 is the paper's. None: 1, or as much less as gives the side with
+        more blur six layers.
     cascade : bool
         False blurs every layer by itself (the paper's slower variant).
     matting : {"seamless", "paper"}
@@ -128,7 +136,7 @@ class Layered:
     """
 
     layers: int | None = None
-    sigma_step: float = 1.0
+    sigma_step: float | None = None
     cascade: bool = True
     matting: str = "seamless"
     engine: str = "auto"
@@ -138,8 +146,9 @@ class Layered:
     def __post_init__(self) -> None:
         if self.layers is not None and not (isinstance(self.layers, int) and 3 <= self.layers <= MAX_LAYERS):
             raise InputError(f"layered: layers is {self.layers!r}; it must be a whole number from 3 to {MAX_LAYERS}.")
-        if not (isinstance(self.sigma_step, int | float) and 0.1 <= self.sigma_step < math.inf):
-            raise InputError(f"layered: sigma_step is {self.sigma_step!r}; it must be a number of at least 0.1 px.")
+        step = self.sigma_step
+        if step is not None and not (isinstance(step, int | float) and 0.1 <= step < math.inf):
+            raise InputError(f"layered: sigma_step is {step!r}; it must be a number of at least 0.1 px.")
         for name, choices in (("matting", ("seamless", "paper")), ("engine", ("auto", "fir", "iir"))):
             if getattr(self, name) not in choices:
                 raise InputError(f"layered: {name} is {getattr(self, name)!r}; choose one of {', '.join(choices)}.")
@@ -177,29 +186,37 @@ class Layered:
     def _stack(self, near_px: float, far_px: float) -> LayerStack:
         """The fewest layers that reach both ends of the CoC range, with the step enlarged until they are few enough."""
         most = self.layers or MAX_LAYERS
-        # A grid of steps, so that a lens in motion keeps to few pass lists.
-        exponent = 0
-        while True:
-            step = self.sigma_step * 2.0 ** (exponent / 8)
+        first = self.sigma_step or _usual_step(max(near_px, far_px), self.matting)
+        for exponent in count():
+            # A grid of steps, so that a lens in motion keeps to few pass lists.
+            step = first * math.pow(2.0, exponent / _STEPS_PER_OCTAVE)
             front, back = (_layers_needed(px, step, self.matting) for px in (near_px, far_px))
             if front + 1 + back <= most:
                 return LayerStack(front, back, step)
-            exponent += 1
+        raise AssertionError("a step that is large enough needs one layer a side")
+
+
+def _usual_step(largest_coc_px: float, matting: str) -> float:
+    for exponent in range(_FINEST_STEP + 1):
+        step = math.pow(2.0, -exponent / _STEPS_PER_OCTAVE)
+        if _layers_needed(largest_coc_px, step, matting) >= _USUAL_LAYERS_A_SIDE:
+            break
+    return step
 
 
 def _layers_needed(largest_coc_px: float, step: float, matting: str) -> int:
     if largest_coc_px < _NEGLIGIBLE_COC_PX:
         return 0
-    count = 1
-    while count < MAX_LAYERS and _side_coc(count, step)[-2 if matting == "paper" else -1] < largest_coc_px:
-        count += 1
-    return count
+    needed = 1
+    while needed < MAX_LAYERS and _side_coc(needed, step)[-2 if matting == "paper" else -1] < largest_coc_px:
+        needed += 1
+    return needed
 
 
 @lru_cache(maxsize=256)
-def _side_coc(count: int, step: float) -> tuple[float, ...]:
-    """CoC radii in px of the layers 0 (focus) to ``count`` on one side: what the filters really add up to."""
-    variances = [0.0] + [_variance(n * step) for n in range(1, count + 1)]
+def _side_coc(last: int, step: float) -> tuple[float, ...]:
+    """CoC radii in px of the layers 0 (focus) to ``last`` on one side: what the filters really add up to."""
+    variances = [0.0] + [_variance(n * step) for n in range(1, last + 1)]
     return tuple(math.sqrt(total) / GAUSSIAN_SIGMA for total in np.cumsum(variances).tolist())
 
 
@@ -232,15 +249,15 @@ def matting_functions(coc: NDArray[np.float64], c1: float, c0: float, matting: s
         ``(up scale, up offset, down scale, down offset)`` in inverse depth. The first layer has no rise and the last no
         fall: they take all that is nearer and farther.
     """
-    count = len(coc)
-    if count == 1:
+    total = len(coc)
+    if total == 1:
         return np.array([(0.0, 1.0, 0.0, 1.0)])
     # anchor[k + 2] is z_k as a CoC, for k = -2 .. K; beyond the layers they go on at the same distance.
     before, after = coc[0] - (coc[1] - coc[0]), coc[-1] + (coc[-1] - coc[-2])
     line = np.array([2 * before - coc[0], before, *coc, after])
     anchor = line if matting == "seamless" else (line + np.append(line[1:], 2 * after - coc[-1])) / 2.0
-    functions = np.empty((count, 4))
-    for k in range(count):
+    functions = np.empty((total, 4))
+    for k in range(total):
         rise_from, rise_to, fall_from, fall_to = anchor[k : k + 4]
         up, down = 1.0 / (rise_to - rise_from), 1.0 / (fall_to - fall_from)
         functions[k] = (c1 * up, (c0 - rise_from) * up, -c1 * down, (fall_to - c0) * down)
@@ -336,10 +353,9 @@ class _Builder:
             self._each_by_itself(run)
 
     def _classify(self) -> None:
-        count = self.stack.total
         self._add(
             "layered_classify",
-            (write("tile_peels"), read("inv_depth"), self.size, np.int32(count), Param("matting", _MATTING)),
+            (write("tile_peels"), read("inv_depth"), self.size, np.int32(self.stack.total), Param("matting", _MATTING)),
             (self.tiles_x, self.tiles_y),
             traffic_bytes=self.shape.layers * self.shape.height * self.shape.pitch * 4,
         )

@@ -16,7 +16,10 @@ def test_rows_match_by_substring_in_any_case() -> None:
     row = Quirk("cuda", "force", Effect.LAST_RESORT, "why", "where", "2025-01-01")
     assert row.matches("NVIDIA CUDA", "GeForce")
     assert not row.matches("NVIDIA CUDA", "Tesla")
-    assert effects_of("Portable Computing Language", "pthread") == {Effect.DRIVER_CACHES_BUILDS}
+    assert effects_of("Portable Computing Language", "pthread") == {
+        Effect.DRIVER_CACHES_BUILDS,
+        Effect.NEEDS_LINKER,
+    }
     assert effects_of("rusticl", "llvmpipe (LLVM 15)") == {Effect.LAST_RESORT}
     assert effects_of("Some Platform", "Some Device") == frozenset()
 

@@ -265,7 +265,9 @@ def test_few_layers_take_larger_steps() -> None:
     lens = Lens(40.0 / frame.camera.focal_px, 1.7)
     few, many = (Layered(layers=n).plan(frame, lens).structure for n in (5, 20))
     assert few.total <= 5 < many.total <= 20
-    assert few.sigma_step > many.sigma_step >= 1.0
+    assert few.sigma_step > many.sigma_step
+    fixed = Layered(sigma_step=1.0).plan(frame, lens).structure
+    assert fixed.sigma_step == 1.0
 
 
 def test_an_enormous_aperture_is_planned_and_rendered(device: Device) -> None:
