@@ -61,7 +61,7 @@ class _DeviceFrame:
 
     frame: LayeredFrame  # holds the arrays, which a CPU device reads in place
     shape: FrameShape
-    color: HostInput
+    arrays: dict[str, HostInput]  # color, and what else of the frame a method asked for
     preparation: Batch  # made inv_depth, and owns it
     ready: Any  # event
     last_use: Any = None  # event
@@ -208,11 +208,8 @@ class Renderer:
             plan = self.method.plan(frame, lens)
             held = self._upload(frame, shape)
             ring = self._ring(shape, plan)
-            submission = ring.submit(
-                {"color": held.color.buffer, "inv_depth": held.preparation.output("inv_depth")},
-                plan.params,
-                [*held.color.waits, held.ready],
-            )
+            inputs, waits = self._inputs(held, ring.program)
+            submission = ring.submit(inputs, plan.params, waits)
             held.last_use = submission.event
             output = "image" if self._supersample == 1 else "resolved"
             download = self.device.pool.download(submission.batch.output(output), image, [submission.event])
@@ -277,15 +274,34 @@ class Renderer:
             {"color": color.buffer, "depth": depth.buffer}, wait_for=[*color.waits, *depth.waits]
         )
         pool.free_input(depth, submission.event)
-        held = self._frames[key] = _DeviceFrame(frame, shape, color, preparation, submission.event)
+        held = _DeviceFrame(frame, shape, {"color": color}, preparation, submission.event)
+        self._frames[key] = held
         return held
+
+    def _inputs(self, held: _DeviceFrame, program: FrameProgram) -> tuple[dict[str, Any], list[Any]]:
+        """What the program reads of the frame, uploaded when it is first asked for, and what to wait for."""
+        buffers, waits = {}, [held.ready]
+        for name in (name for name, buffer in program.buffers.items() if buffer.role is Role.INPUT):
+            if name == "inv_depth":
+                buffers[name] = held.preparation.output(name)
+                continue
+            if name not in held.arrays:
+                if name not in held.frame.surface:
+                    raise InputError(
+                        f"Method {self.method.name!r} needs the frame's {name} buffer; capture with surface=True."
+                    )
+                held.arrays[name] = self.device.pool.to_device(held.frame.surface[name], f"upload {name}")
+            buffers[name] = held.arrays[name].buffer
+            waits += held.arrays[name].waits
+        return buffers, waits
 
     def _free_preparation(self, shape: FrameShape) -> Batch | None:
         """Make room for one more frame; hand over what prepared the one that goes, if it fits the next."""
         preparation = None
         while len(self._frames) > self._slots:
             _, old = self._frames.popitem(last=False)
-            self.device.pool.free_input(old.color, old.last_use)
+            for array in old.arrays.values():
+                self.device.pool.free_input(array, old.last_use)
             if old.last_use is not None:
                 old.preparation.hold(old.last_use)
             if preparation is None and old.shape == shape:

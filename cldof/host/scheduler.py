@@ -360,12 +360,17 @@ class FrameRing:
     device : Device
     slots : int
         The most frames in flight.
+
+    Attributes
+    ----------
+    program : FrameProgram
     """
 
     def __init__(self, program: FrameProgram, device: Device, slots: int = 2) -> None:
         if slots < 1:
             raise InputError(f"a frame ring of {slots} slots was asked for; it needs at least 1")
         self._slots = slots
+        self.program = program
         # In the order of their last submission.
         self.batches: deque[Batch] = deque([compile(program, device)])
 
@@ -378,7 +383,7 @@ class FrameRing:
         """As :meth:`Batch.submit`, on a free batch; its outputs are ``submission.batch.output(name)``."""
         batch = next((batch for batch in self.batches if batch.is_idle), None)
         if batch is None and len(self.batches) < self._slots:
-            batch = compile(self.batches[0].program, self.batches[0].device)
+            batch = compile(self.program, self.batches[0].device)
             self.batches.append(batch)
         batch = batch or self.batches[0]
         self.batches.remove(batch)

@@ -23,11 +23,20 @@ class FrameShape(NamedTuple):
     guard_px: int
     is_opaque: bool
     has_glass: bool
+    surface: tuple[str, ...] = ()  # names of the surface buffers that the frame has
 
     @classmethod
     def of(cls, frame: LayeredFrame) -> FrameShape:
         """The shape of a frame."""
-        return cls(frame.layer_count, frame.height, frame.width, frame.guard_px, frame.is_opaque, frame.has_glass)
+        return cls(
+            frame.layer_count,
+            frame.height,
+            frame.width,
+            frame.guard_px,
+            frame.is_opaque,
+            frame.has_glass,
+            tuple(sorted(frame.surface)),
+        )
 
     @property
     def pitch(self) -> int:
@@ -73,7 +82,8 @@ class Method(Protocol):
     """A depth-of-field method: turns lens and frame into passes, and owns no OpenCL object.
 
     Passes may read the inputs ``color`` (float[layers][height][width][4]) and ``inv_depth``
-    (float[layers][height][pitch], see kernels/frame.cl) and write the output ``image``
+    (float[layers][height][pitch], see kernels/frame.cl), and of frames that have them ``normal`` and ``albedo``
+    (float[layers][height][width][3]) and ``shininess`` (float[layers][height][width]). They write the output ``image``
     (float[output height][output width][4]).
     """
 
