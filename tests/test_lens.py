@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,7 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cldof import Camera, InputError, Lens
-from cldof.lens import GAUSSIAN_SIGMA, lens_samples
+from cldof.lens import (
+    GAUSSIAN_SIGMA,
+    Aperture,
+    DiscAperture,
+    GaussianAperture,
+    ImageAperture,
+    PolygonAperture,
+    lens_samples,
+)
 
 CAMERA = Camera(1024, 768, yfov_deg=40.0)
 
@@ -187,35 +197,240 @@ def test_metadata_is_json_without_infinity() -> None:
         "aperture_radius_m": 0.01,
         "focus_distance_m": None,
         "focal_length_mm": None,
+        "aperture": {"shape": "disc", "ratio": 1.0},
     }
 
 
-@pytest.mark.parametrize("count", [1, 2, 17, 256, 4096])
-def test_disc_samples(count: int) -> None:
-    points = lens_samples(count, "disc")
-    assert points.shape == (count, 2)
-    assert np.abs(points.mean(axis=0)).max() < 1e-12
-    # The mean is taken out, so a few points may stick out of the disc by that much.
-    assert np.hypot(*points.T).max() <= 1.0 + 1.0 / count
-    if count >= 256:  # a uniform disc: E[r^2] = 1/2, equal and uncorrelated axes
-        assert np.cov(points.T, bias=True) == pytest.approx(np.eye(2) / 4, abs=2.0 / count)
+ROWS, COLUMNS = np.indices((65, 65)) - 32.0
+RING = ((np.hypot(COLUMNS, ROWS) < 30.0) & (np.hypot(COLUMNS, ROWS) > 12.0)).astype(float)
+
+BOUNDED = [
+    DiscAperture(),
+    DiscAperture(ratio=1.8),
+    PolygonAperture(3),
+    PolygonAperture(4, 45.0),
+    PolygonAperture(5, rotation_deg=-17.0, curvature=0.4),
+    PolygonAperture(6, 10.0, ratio=0.5),
+    PolygonAperture(9, 100.0, 1.0),
+]
+
+
+def covariance(points: np.ndarray) -> np.ndarray:
+    return np.asarray(np.cov(points.T, bias=True))
+
+
+def unsqueezed(points: np.ndarray, aperture: Aperture) -> np.ndarray:
+    return np.asarray(points / (min(1.0, 1.0 / aperture.ratio), min(1.0, aperture.ratio)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 17, 256, 4096])
+@pytest.mark.parametrize("aperture", BOUNDED, ids=str)
+def test_samples_are_centred_and_inside_the_unit_disc(aperture: Aperture, count: int) -> None:
+    for seed in range(5):
+        points = lens_samples(count, aperture, seed)
+        assert points.shape == (count, 2)
+        assert np.abs(points.mean(axis=0)).max() < 1e-12
+        assert np.hypot(*points.T).max() <= 1.0 + 1e-12
+
+
+@pytest.mark.parametrize("count", [64, 256, 4096])
+def test_second_moment_of_the_disc(count: int) -> None:
+    # E[x^2] = E[y^2] = 1/4, and 1/4 of the squared ratio along the squeezed axis.
+    assert covariance(lens_samples(count, "disc")) == pytest.approx(np.eye(2) / 4, abs=2.0 / count)
+    squeezed = lens_samples(count, DiscAperture(ratio=2.0))
+    assert covariance(squeezed) == pytest.approx(np.diag([1 / 16, 1 / 4]), abs=2.0 / count)
+    flat = lens_samples(count, DiscAperture(ratio=0.5))
+    assert covariance(flat) == pytest.approx(np.diag([1 / 4, 1 / 16]), abs=2.0 / count)
+
+
+@pytest.mark.parametrize("blades", [3, 4, 5, 6, 9])
+@pytest.mark.parametrize("rotation", [0.0, 23.0])
+def test_second_moment_of_polygons(blades: int, rotation: float) -> None:
+    # Second moment of area of a regular polygon with circumradius 1 over its area: (2 + cos(2 pi / n)) / 12.
+    expected = (2.0 + math.cos(2.0 * math.pi / blades)) / 12.0
+    points = lens_samples(4096, PolygonAperture(blades, rotation))
+    assert covariance(points) == pytest.approx(expected * np.eye(2), abs=5e-4)
+
+
+@pytest.mark.parametrize("aperture", [a for a in BOUNDED if isinstance(a, PolygonAperture)], ids=str)
+def test_polygons_keep_to_their_edges_and_fill_them(aperture: PolygonAperture) -> None:
+    points = unsqueezed(lens_samples(8192, aperture), aperture)
+    radius, angle = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
+    share = (radius / aperture.rim(angle)) ** 2
+    assert share.max() <= 1.0 + 1e-12
+    # Area-preserving: the share of area inside each point is uniform, in every blade.
+    assert np.abs(np.sort(share) - (np.arange(8192) + 0.5) / 8192).max() < 2e-3
+    sector = ((angle - math.radians(aperture.rotation_deg)) % (2.0 * math.pi) * aperture.blades / (2.0 * math.pi)) % 1.0
+    blade = ((angle - math.radians(aperture.rotation_deg)) % (2.0 * math.pi)) * aperture.blades // (2.0 * math.pi)
+    counts = np.bincount(blade.astype(int), minlength=aperture.blades)
+    assert counts == pytest.approx(8192 / aperture.blades, rel=0.02)
+    assert sector.mean() == pytest.approx(0.5, abs=5e-3)  # symmetric across a blade
+
+
+@pytest.mark.parametrize("blades", [3, 5, 8])
+def test_straight_blades_are_half_planes(blades: int) -> None:
+    points = lens_samples(4096, PolygonAperture(blades, 30.0))
+    middles = math.radians(30.0) + (np.arange(blades) + 0.5) * 2.0 * math.pi / blades
+    along = points @ np.stack([np.cos(middles), np.sin(middles)])
+    apothem = math.cos(math.pi / blades)
+    assert along.max() <= apothem + 1e-12
+    assert along.max(axis=0) == pytest.approx(apothem, abs=0.02)
+    corner = PolygonAperture(blades, 30.0).rim(math.radians(30.0))
+    assert corner == pytest.approx(1.0, abs=1e-12)
+    assert PolygonAperture(blades).area == pytest.approx(blades / 2 * math.sin(2 * math.pi / blades), rel=1e-9)
+
+
+@pytest.mark.parametrize("curvature", [0.0, 1e-6, 0.3, 0.8, 1.0])
+def test_curved_blades_are_arcs_through_the_corners(curvature: float) -> None:
+    aperture = PolygonAperture(5, 0.0, curvature)
+    angle = np.linspace(0.0, 2.0 * math.pi / 5, 101)
+    rim = aperture.rim(angle)
+    assert rim[[0, -1]] == pytest.approx(1.0)
+    x, y = rim * np.cos(angle), rim * np.sin(angle)
+    if curvature > 1e-3:  # all at one distance, 1 / curvature, from a point on the blade's normal
+        half = math.pi / 5
+        centre = math.cos(half) - math.sqrt(1.0 / curvature**2 - math.sin(half) ** 2)
+        cx, cy = centre * math.cos(half), centre * math.sin(half)
+        assert np.hypot(x - cx, y - cy) == pytest.approx(1.0 / curvature)
+    else:
+        assert x * math.cos(math.pi / 5) + y * math.sin(math.pi / 5) == pytest.approx(math.cos(math.pi / 5), abs=1e-6)
+
+
+def test_full_curvature_is_the_disc() -> None:
+    disc, polygon = lens_samples(500, "disc", 3), lens_samples(500, PolygonAperture(7, 0.0, 1.0), 3)
+    assert polygon == pytest.approx(disc, abs=1e-6)
+    assert PolygonAperture(7, 12.0, 1.0).area == pytest.approx(math.pi, rel=1e-12)
+
+
+def test_rotation_comes_before_the_squeeze() -> None:
+    turned = PolygonAperture(4, 45.0, ratio=2.0)  # an upright square, squeezed to a tall rectangle
+    points = np.abs(lens_samples(4096, turned))
+    assert points.max(axis=0) == pytest.approx([math.sqrt(0.5) / 2, math.sqrt(0.5)], abs=0.01)
 
 
 def test_gaussian_samples() -> None:
     points = lens_samples(4096, "gaussian")
     assert np.abs(points.mean(axis=0)).max() < 1e-12
-    assert np.cov(points.T, bias=True) == pytest.approx(GAUSSIAN_SIGMA**2 * np.eye(2), abs=3e-3)
+    assert covariance(points) == pytest.approx(GAUSSIAN_SIGMA**2 * np.eye(2), abs=3e-3)
     fourth = (points**4).mean(axis=0)
     assert fourth == pytest.approx(3 * GAUSSIAN_SIGMA**4 * np.ones(2), rel=0.02)  # a Gaussian's kurtosis is 3
+    squeezed = lens_samples(4096, GaussianAperture(ratio=2.0))
+    assert covariance(squeezed) == pytest.approx(np.diag([1 / 16, 1 / 4]), abs=3e-3)
 
 
-def test_samples_depend_on_the_seed_alone() -> None:
-    assert np.array_equal(lens_samples(64, seed=3), lens_samples(64, seed=3))
-    assert not np.allclose(lens_samples(64, seed=3), lens_samples(64, seed=4))
+def test_image_apertures_let_light_through_by_weight() -> None:
+    image = np.zeros((8, 8))
+    image[2, 3], image[5, 4], image[4, 1] = 1.0, 2.0, 5.0
+    points = lens_samples(4000, ImageAperture(image))
+    column, row = np.floor((points[:, 0] + 1.0) * 4.0), np.floor((1.0 - points[:, 1]) * 4.0)
+    for (y, x), share in {(2, 3): 1 / 8, (5, 4): 2 / 8, (4, 1): 5 / 8}.items():
+        assert np.mean((row == y) & (column == x)) == pytest.approx(share, abs=2e-3)
+    centroid = np.array([[3.5, 2.5], [4.5, 5.5], [1.5, 4.5]]).T @ [1 / 8, 2 / 8, 5 / 8]
+    assert points.mean(axis=0) == pytest.approx([centroid[0] / 4 - 1, 1 - centroid[1] / 4], abs=2e-3)
+
+
+def test_image_of_a_ring() -> None:
+    aperture = ImageAperture(RING)
+    points = lens_samples(4096, aperture, 2)
+    radius = np.hypot(*points.T)
+    assert radius.max() <= 30.7 / 32.5 and radius.min() >= 11.3 / 32.5
+    outer, inner = 30 / 32.5, 12 / 32.5
+    assert covariance(points) == pytest.approx((outer**2 + inner**2) / 4 * np.eye(2), abs=3e-3)
+    wide = ImageAperture(np.pad(RING, ((0, 0), (20, 20))))  # the longer side spans the diameter
+    assert np.hypot(*lens_samples(4096, wide, 2).T).max() <= 30.7 / 52.5
+    squeezed = lens_samples(4096, ImageAperture(RING, ratio=2.0), 2)
+    assert squeezed == pytest.approx(points * (0.5, 1.0))
+
+
+def test_a_disc_as_an_image_is_the_disc() -> None:
+    rows, columns = np.indices((257, 257)) - 128.0
+    points = lens_samples(4096, ImageAperture(np.hypot(columns, rows) <= 128.4))
+    assert covariance(points) == pytest.approx(np.eye(2) / 4, abs=2e-3)
+    assert np.hypot(*points.T).max() <= 1.0 + 1e-12
+
+
+@pytest.mark.parametrize("aperture", [*BOUNDED, GaussianAperture(), ImageAperture(RING)], ids=str)
+def test_samples_depend_on_the_seed_alone(aperture: Aperture) -> None:
+    assert np.array_equal(lens_samples(64, aperture, seed=3), lens_samples(64, aperture, seed=3))
+    assert not np.allclose(lens_samples(64, aperture, seed=3), lens_samples(64, aperture, seed=4))
+
+
+def half_plane_errors(count: int, seed: int) -> np.ndarray:
+    """Share of a disc on one side of lines, sampled less exact: the error of the blur of an edge."""
+    t, angle = np.meshgrid(np.linspace(-0.95, 0.95, 39), np.arange(12) * math.pi / 6)
+    x, y = lens_samples(count, "disc", seed).T
+    sampled = (np.cos(angle)[..., None] * x + np.sin(angle)[..., None] * y < t[..., None]).mean(axis=-1)
+    return np.asarray(sampled - 0.5 - (t * np.sqrt(1.0 - t * t) + np.arcsin(t)) / math.pi).ravel()
+
+
+def test_seeds_are_independent_estimates_and_better_than_random() -> None:
+    errors = np.array([half_plane_errors(64, seed) for seed in range(60)])
+    rms = math.sqrt(float((errors**2).mean()))
+    assert rms < 0.014  # random points: sqrt(p (1 - p) / 64), 0.05 on average
+    assert math.sqrt(float((errors.mean(axis=0) ** 2).mean())) < 2.0 * rms / math.sqrt(60)  # unbiased
+    pairs = (errors[::2] * errors[1::2]).mean() / rms**2
+    assert abs(pairs) < 0.15  # so half the difference of two tells the error of their mean
+    assert math.sqrt(float(np.mean([half_plane_errors(1024, seed) ** 2 for seed in range(9)]))) < rms / 6.0
+
+
+def test_apertures_of_a_lens() -> None:
+    assert Lens(0.1, 2.0).aperture == DiscAperture()
+    assert Lens(0.1, 2.0, aperture="gaussian").aperture == GaussianAperture()  # type: ignore[arg-type]
+    blades = PolygonAperture(7, 5.0, 0.2, ratio=1.5)
+    lens = Lens.photographic(50.0, 2.0, 3.0, blades)
+    assert lens.aperture is blades
+    assert lens.to_dict()["aperture"] == {
+        "shape": "polygon",
+        "ratio": 1.5,
+        "blades": 7,
+        "rotation_deg": 5.0,
+        "curvature": 0.2,
+    }
+    with pytest.raises(InputError, match="shape 'star'"):
+        Lens(0.1, 2.0, aperture="star")  # type: ignore[arg-type]
+
+
+def test_image_apertures_are_equal_by_content() -> None:
+    first, second = ImageAperture(RING), ImageAperture(3.0 * RING)
+    assert first == second and hash(first) == hash(second)
+    assert first != ImageAperture(np.roll(RING, 1, 0)) and first != ImageAperture(RING, ratio=2.0)
+    data = Lens(0.1, 2.0, aperture=first).to_dict()["aperture"]
+    assert json.loads(json.dumps(data)) == data and data["image_size"] == [65, 65]
+    with pytest.raises(ValueError, match="read-only"):
+        first.image[0, 0] = 1.0
+
+
+@pytest.mark.parametrize(
+    "make, says",
+    [
+        (lambda: DiscAperture(ratio=0.0), "ratio is 0.0"),
+        (lambda: GaussianAperture(ratio=math.nan), "ratio is nan"),
+        (lambda: PolygonAperture(2), "blades is 2"),
+        (lambda: PolygonAperture(5.5), "blades is 5.5"),  # type: ignore[arg-type]
+        (lambda: PolygonAperture(math.nan), "blades is nan"),  # type: ignore[arg-type]
+        (lambda: PolygonAperture(65), "blades is 65"),
+        (lambda: PolygonAperture("six"), "blades is 'six'"),  # type: ignore[arg-type]
+        (lambda: PolygonAperture(6, math.inf), "rotation_deg is inf"),
+        (lambda: PolygonAperture(6, 0.0, 1.1), "curvature is 1.1"),
+        (lambda: PolygonAperture(6, 0.0, -0.1), "curvature is -0.1"),
+        (lambda: ImageAperture(np.zeros((4, 4))), "black"),
+        (lambda: ImageAperture(np.ones((4, 4, 3))), r"shape \(4, 4, 3\)"),
+        (lambda: ImageAperture(np.zeros((0, 4))), r"shape \(0, 4\)"),
+        (lambda: ImageAperture(-RING), "negative"),
+        (lambda: ImageAperture(RING * math.nan), "negative, NaN"),
+        (lambda: ImageAperture(np.ones((64, 64))), "outside the inscribed circle"),
+        (lambda: ImageAperture("ring"), "array of numbers"),  # type: ignore[arg-type]
+    ],
+)
+def test_bad_apertures_are_refused(make: Callable[[], Aperture], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        make()
 
 
 def test_bad_samples_are_refused() -> None:
     with pytest.raises(InputError, match="at least 1"):
         lens_samples(0)
+    with pytest.raises(InputError, match="seed is -1"):
+        lens_samples(8, seed=-1)
     with pytest.raises(InputError, match="'square'"):
         lens_samples(8, "square")
