@@ -8,29 +8,32 @@ light each surface on its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from functools import cache
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..camera import Camera
 from ..errors import SceneError
+from . import hard_scenes
 from .scene import Ambient, DirectionalLight, Gradient, Material, Node, PointLight, Scene
 from .shapes import ball, block, knot, lathe, leaf, merge, moved, pipe, quad, ring, star
-from .textures import bricks, checker, coverage, noise, picture, planks, poster, rgb, shadow_mask, speckle, veins
+from .staging import Light, aimed_camera, floor, glow, leaf_material, merged, mirrored, paint, plant, printed
+from .textures import bricks, checker, coverage, noise, picture, planks, poster, rgb, speckle
 
-__all__ = ["BuiltinScene", "builtin_scene", "builtin_scenes"]
+__all__ = ["SHOW", "TEST", "BuiltinScene", "builtin_scene", "builtin_scenes"]
 
-Vector = tuple[float, float, float]
+SHOW, TEST = "to show off", "to test"
 
 
 class BuiltinScene(NamedTuple):
-    """A line of the list that ``cldof scenes`` prints."""
+    """A line of the list that ``cldof scenes`` prints.
+
+    ``group`` is :data:`SHOW` or :data:`TEST`; scenes to test say what they are hard for.
+    """
 
     description: str
     make: Callable[[], Scene]
+    group: str = SHOW
 
 
 def builtin_scenes() -> dict[str, BuiltinScene]:
@@ -42,6 +45,7 @@ def builtin_scenes() -> dict[str, BuiltinScene]:
         "tabletop": BuiltinScene("chess pieces at arm's length, shallow focus, bright HDR lamps far behind", _tabletop),
         "glass": BuiltinScene("a tinted glass pane between sculptures, prints on a far wall", _glass),
         "floating": BuiltinScene("shapes in mid-air over a transparent background", _floating),
+        **{name: BuiltinScene(text, make, TEST) for name, (text, make) in hard_scenes.HARD_SCENES.items()},
     }
 
 
@@ -57,97 +61,6 @@ def builtin_scene(name: str) -> Scene:
     if name not in scenes:
         raise SceneError(f"There is no built-in scene {name!r}; there are {', '.join(scenes)}.")
     return scenes[name].make()
-
-
-def _merged(nodes: Sequence[Node]) -> tuple[Node, ...]:
-    """One node for each material: drawing takes time by the node as well as by the triangle."""
-    groups: dict[int, list[Node]] = {}
-    for node in nodes:
-        groups.setdefault(id(node.material), []).append(node)
-    return tuple(
-        group[0] if len(group) == 1 else Node(merge([node.mesh for node in group]), material=group[0].material)
-        for group in groups.values()
-    )
-
-
-def _camera(eye: Vector, target: Vector, yfov_deg: float, near: float) -> Camera:
-    forward = np.subtract(target, eye)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 1.0, 0.0))
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(right, forward), -forward], axis=1)
-    pose[:3, 3] = eye
-    return Camera(1024, 1024, yfov_deg, near=near, pose=pose)
-
-
-@cache
-def _paint(color: str, roughness: float = 0.5, metallic: float = 0.0) -> Material:
-    return Material(base_color=(*rgb(color), 1.0), roughness=roughness, metallic=metallic)
-
-
-def _printed(linear: Any, roughness: float = 0.7, unlit: bool = False) -> Material:
-    return Material(
-        base_color=(1.0, 1.0, 1.0, 1.0), base_color_texture=picture(linear), roughness=roughness, unlit=unlit
-    )
-
-
-def _glow(color: str, radiance: float) -> Material:
-    red, green, blue = rgb(color)
-    emissive = (radiance * red, radiance * green, radiance * blue)
-    return Material(base_color=(0.0, 0.0, 0.0, 1.0), emissive=emissive, unlit=True)
-
-
-def _mirrored(horizon: Vector, top: Vector) -> Vector:
-    """The bottom of a sky that has ``top`` above and ``horizon`` in the middle."""
-    red, green, blue = (max(0.0, 2 * h - t) for h, t in zip(horizon, top, strict=True))
-    return red, green, blue
-
-
-class _Light(NamedTuple):
-    """One sun and one sky, so that painted floors and shaded objects agree."""
-
-    direction: Vector
-    sun: Vector
-    ambient: Ambient
-
-    def lights(self) -> tuple[DirectionalLight, ...]:
-        return (DirectionalLight(self.direction, self.sun),)
-
-    def on_floor(self, sun_mask: Any, sky_mask: Any) -> NDArray[np.float32]:
-        """Light on a surface facing up, (H, W, 3), given what is kept from it."""
-        slope = -self.direction[1] / math.hypot(*self.direction)
-        lit = np.array(self.sun, np.float32) * slope * (1.0 - np.asarray(sun_mask))[..., None]
-        return np.asarray(
-            lit + np.array(self.ambient.sky, np.float32) * (1.0 - np.asarray(sky_mask))[..., None], np.float32
-        )
-
-
-def _floor(
-    albedo: NDArray[np.float32],
-    area: tuple[float, float, float, float],
-    light: _Light,
-    casters: Sequence[Any],
-    *,
-    height: float = 0.0,
-    softness_m: float = 0.03,
-    fade: tuple[Vector, Vector, float, float] | None = None,
-) -> Node:
-    """A floor with its light painted on. ``area`` is as in shadow_mask; ``fade`` is (colour, eye, start, end in m)."""
-    size = (albedo.shape[0], albedo.shape[1])
-    sun = shadow_mask(casters, light.direction, area, size, softness_m, height)
-    sky = np.minimum(1.0, shadow_mask(casters, (0.0, -1.0, 0.0), area, size, 3.0 * softness_m, height) * 1.1) * 0.75
-    color = albedo * light.on_floor(sun, sky)
-    left, far, right, near = area
-    if fade:
-        tint, eye, start, end = fade
-        z = np.linspace(far, near, size[0], dtype=np.float32)[:, None]
-        x = np.linspace(left, right, size[1], dtype=np.float32)[None, :]
-        amount = np.clip((np.hypot(x - eye[0], z - eye[2]) - start) / (end - start), 0, 1)
-        amount = (amount * amount * (3 - 2 * amount))[..., None]
-        color = color * (1 - amount) + np.array(tint, np.float32) * amount
-    mesh = quad((left, height, near), (right - left, 0, 0), (0, 0, far - near))
-    return Node(mesh, material=_printed(color, unlit=True))
 
 
 def _zoo(rng: np.random.Generator) -> list[Any]:
@@ -178,7 +91,7 @@ def _zoo(rng: np.random.Generator) -> list[Any]:
 
 def _row() -> Scene:
     rng = np.random.default_rng(11)
-    light = _Light((-0.55, -1.0, -0.45), (0.85, 0.79, 0.7), Ambient((0.42, 0.45, 0.5), (0.30, 0.26, 0.22)))
+    light = Light((-0.55, -1.0, -0.45), (0.85, 0.79, 0.7), Ambient((0.42, 0.45, 0.5), (0.30, 0.26, 0.22)))
     eye = (0.0, 0.68, 0.0)
     colors = ["#e4572e", "#2e86ab", "#f2c14e", "#3f8f5b", "#8e5fa8", "#e76f8a", "#2a9d8f", "#d98324", "#4f6d9f"]
     colors += ["#c8553d", "#87b38d", "#b8416a"]
@@ -190,7 +103,7 @@ def _row() -> Scene:
         # Left, right and between in turn, closing in on the middle with distance.
         sway = (-0.19, 0.17, -0.04, 0.24, -0.24)[i % 5] * (1.05 - 0.35 * i / count)
         mesh = moved(shapes[i % len(shapes)], (sway * depth, 0.0, -depth), (0, float(rng.uniform(0, 90)), 0), 0.66)
-        nodes.append(Node(mesh, material=_paint(colors[i % len(colors)], (0.35, 0.6, 0.25)[i % 3])))
+        nodes.append(Node(mesh, material=paint(colors[i % len(colors)], (0.35, 0.6, 0.25)[i % 3])))
         casters.append(mesh)
     haze = rgb("#d7dfe6")
     near_area, far_area = (-3.0, -7.0, 3.0, 0.0), (-40.0, -70.0, 40.0, -7.0)
@@ -200,45 +113,20 @@ def _row() -> Scene:
     far_albedo = checker(rng, (1260, 1600), (126, 160), tones)
     side_albedo = checker(rng, (700, 700), (14, 14), tones)
     fade = (haze, eye, 9.0, 55.0)
-    nodes.append(_floor(near_albedo, near_area, light, casters, fade=fade))
-    nodes.append(_floor(far_albedo, far_area, light, casters, fade=fade, softness_m=0.05))
+    nodes.append(floor(near_albedo, near_area, light, casters, fade=fade))
+    nodes.append(floor(far_albedo, far_area, light, casters, fade=fade, softness_m=0.05))
     for left in (-10.0, 3.0):
-        nodes.append(_floor(side_albedo, (left, -7.0, left + 7.0, 0.0), light, casters, fade=fade))
+        nodes.append(floor(side_albedo, (left, -7.0, left + 7.0, 0.0), light, casters, fade=fade))
     top = rgb("#6f9bc4")
     return Scene(
         "row",
-        _merged(nodes),
-        camera=_camera(eye, (0.0, 0.26, -3.0), 33.0, 0.3),
+        merged(nodes),
+        camera=aimed_camera(eye, (0.0, 0.26, -3.0), 33.0, 0.3),
         lights=light.lights(),
         ambient=light.ambient,
-        background=Gradient(top=top, bottom=_mirrored(haze, top)),
+        background=Gradient(top=top, bottom=mirrored(haze, top)),
         focus_distance_m=4.1,
         aperture_radius_m=0.027,
-    )
-
-
-def _plant(rng: np.random.Generator, at: Vector, size: float, count: int, material: Material) -> tuple[Node, Any]:
-    leaves = []
-    for i in range(count):
-        lean = rng.uniform(15, 75)
-        length = size * rng.uniform(0.7, 1.1)
-        leaves.append(
-            moved(
-                leaf(length, 0.3 * length, bend=float(rng.uniform(0.3, 0.8)), steps=7),
-                at,
-                (float(rng.uniform(-20, 20)), i * 137.5, lean if i % 2 else 0.8 * lean),
-            )
-        )
-    mesh = merge(leaves)
-    return Node(mesh, material=material), mesh
-
-
-def _leaf_material(rng: np.random.Generator, color: str, light: str) -> Material:
-    return Material(
-        base_color=(1.0, 1.0, 1.0, 1.0),
-        base_color_texture=picture(veins(rng, (128, 256), color, light)),
-        roughness=0.5,
-        double_sided=True,
     )
 
 
@@ -250,7 +138,7 @@ def _pot(radius: float, height: float) -> Any:
 
 def _fence() -> Scene:
     rng = np.random.default_rng(23)
-    light = _Light((0.5, -0.9, -0.62), (0.92, 0.84, 0.7), Ambient((0.36, 0.4, 0.48), (0.2, 0.18, 0.15)))
+    light = Light((0.5, -0.9, -0.62), (0.92, 0.84, 0.7), Ambient((0.36, 0.4, 0.48), (0.2, 0.18, 0.15)))
     nodes: list[Node] = []
     casters: list[Any] = []
 
@@ -264,9 +152,9 @@ def _fence() -> Scene:
     wall = bricks(rng, (1300, 2200), 58, 30, palette, "#b8ab9c")
     rows = np.linspace(1, 0, 1300, dtype=np.float32)[:, None, None]
     wall *= 0.72 + 0.28 * np.clip(rows * 6, 0, 1)  # darker where it meets the ground
-    add(quad((-3.6, 0.0, wall_z), (7.2, 0, 0), (0, 4.2, 0)), _printed(wall, 0.9), casts=False)
+    add(quad((-3.6, 0.0, wall_z), (7.2, 0, 0), (0, 4.2, 0)), printed(wall, 0.9), casts=False)
 
-    white, teal = _paint("#ece6da", 0.5), _paint("#1f6f78", 0.4)
+    white, teal = paint("#ece6da", 0.5), paint("#1f6f78", 0.4)
     # A door with four panels and a brass knob.
     door_x = -0.78
     for dx, width in ((-0.49, 0.09), (0.49, 0.09)):
@@ -275,15 +163,15 @@ def _fence() -> Scene:
     add(moved(block((0.9, 2.05, 0.06), 0.008), (door_x, 1.025, wall_z + 0.02)), teal)
     for y, tall in ((0.5, 0.62), (1.45, 0.92)):
         for dx in (-0.2, 0.2):
-            add(moved(block((0.3, tall, 0.05), 0.02), (door_x + dx, y, wall_z + 0.045)), _paint("#2b8a92", 0.35))
-    add(moved(ball(0.035, 24), (door_x + 0.38, 1.0, wall_z + 0.1)), _paint("#d9a441", 0.25, 0.6))
-    add(moved(block((1.3, 0.14, 0.42), 0.02), (door_x, 0.07, wall_z + 0.2)), _paint("#a9a094", 0.9))
+            add(moved(block((0.3, tall, 0.05), 0.02), (door_x + dx, y, wall_z + 0.045)), paint("#2b8a92", 0.35))
+    add(moved(ball(0.035, 24), (door_x + 0.38, 1.0, wall_z + 0.1)), paint("#d9a441", 0.25, 0.6))
+    add(moved(block((1.3, 0.14, 0.42), 0.02), (door_x, 0.07, wall_z + 0.2)), paint("#a9a094", 0.9))
     # A window with a lamp behind it, a sill and shutters.
     win_x, win_y = 0.95, 1.42
     inside = noise(rng, 128, 128, 3, 2)[..., None] * np.array(rgb("#ffcf87"), np.float32) * 0.5 + np.array(
         rgb("#5b4634"), np.float32
     )
-    add(quad((win_x - 0.45, win_y - 0.55, wall_z + 0.012), (0.9, 0, 0), (0, 1.1, 0)), _printed(inside, unlit=True))
+    add(quad((win_x - 0.45, win_y - 0.55, wall_z + 0.012), (0.9, 0, 0), (0, 1.1, 0)), printed(inside, unlit=True))
     for dx in (-0.45, 0.0, 0.45):
         add(moved(block((0.06, 1.16, 0.08), 0.01), (win_x + dx, win_y, wall_z + 0.03)), white)
     for dy in (-0.55, 0.05, 0.55):
@@ -296,37 +184,37 @@ def _fence() -> Scene:
             slat = moved(
                 block((0.34, 0.075, 0.02), 0.006), (shutter_x, win_y - 0.48 + 0.12 * k, wall_z + 0.06), (35, 0, 0)
             )
-            add(slat, _paint("#2b8a92", 0.4))
+            add(slat, paint("#2b8a92", 0.4))
     # Flowers on the sill and pots by the wall.
-    green = [_leaf_material(rng, "#3f7d3a", "#8fbf6a"), _leaf_material(rng, "#5a8f3c", "#b4d17c")]
+    green = [leaf_material(rng, "#3f7d3a", "#8fbf6a"), leaf_material(rng, "#5a8f3c", "#b4d17c")]
     petals = ["#e63b5a", "#f4a63a", "#f6e05a", "#d65db1", "#ffffff"]
-    add(moved(block((0.9, 0.16, 0.17), 0.015), (win_x, win_y - 0.505, wall_z + 0.13)), _paint("#7a4a2f", 0.8))
+    add(moved(block((0.9, 0.16, 0.17), 0.015), (win_x, win_y - 0.505, wall_z + 0.13)), paint("#7a4a2f", 0.8))
     for i in range(11):
         x = win_x - 0.4 + 0.08 * i
-        node, mesh = _plant(rng, (x, win_y - 0.43, wall_z + 0.14), 0.14, 5, green[i % 2])
+        node, mesh = plant(rng, (x, win_y - 0.43, wall_z + 0.14), 0.14, 5, green[i % 2])
         nodes.append(node)
         casters.append(mesh)
         bloom = (x + float(rng.uniform(-0.02, 0.02)), win_y - 0.33 + float(rng.uniform(0, 0.07)), wall_z + 0.19)
-        add(moved(ball(0.034, 16), bloom, scale=(1, 0.8, 1)), _paint(petals[i % 5], 0.6))
+        add(moved(ball(0.034, 16), bloom, scale=(1, 0.8, 1)), paint(petals[i % 5], 0.6))
     for x, z, r, tall, leaves in (
         (-1.75, -5.2, 0.24, 0.4, 26),
         (-0.02, -5.25, 0.2, 0.34, 22),
         (2.0, -5.1, 0.28, 0.46, 30),
     ):
-        add(moved(_pot(r, tall), (x, 0, z)), _paint("#b8623f", 0.85))
-        node, mesh = _plant(rng, (x, 0.9 * tall, z), 2.2 * r, leaves, green[leaves % 2])
+        add(moved(_pot(r, tall), (x, 0, z)), paint("#b8623f", 0.85))
+        node, mesh = plant(rng, (x, 0.9 * tall, z), 2.2 * r, leaves, green[leaves % 2])
         nodes.append(node)
         casters.append(mesh)
     # A bench of slats under the window.
-    wood = _printed(planks(rng, (64, 512), 1, ("#7a5230", "#b98952")), 0.6)
+    wood = printed(planks(rng, (64, 512), 1, ("#7a5230", "#b98952")), 0.6)
     for k in range(3):
         add(moved(block((1.25, 0.035, 0.11), 0.01), (0.95, 0.46, wall_z + 0.32 + 0.13 * k)), wood)
     for dx in (-0.5, 0.5):
-        add(moved(block((0.06, 0.45, 0.36), 0.015), (0.95 + dx, 0.225, wall_z + 0.45)), _paint("#2f3437", 0.5))
+        add(moved(block((0.06, 0.45, 0.36), 0.015), (0.95 + dx, 0.225, wall_z + 0.45)), paint("#2f3437", 0.5))
 
     # The fence itself: pickets and two rails, at three quarters of a metre.
     picket_z = -0.78
-    paint = _paint("#f1ede2", 0.55)
+    whitewash = paint("#f1ede2", 0.55)
     for i in range(-11, 12):
         x = 0.086 * i + 0.03
         board = merge(
@@ -336,17 +224,17 @@ def _fence() -> Scene:
             ]
         )
         lean = float(rng.uniform(-0.8, 0.8))
-        add(moved(board, (x, 0.345 + float(rng.uniform(-0.006, 0.006)), picket_z), (0, 0, lean)), paint)
+        add(moved(board, (x, 0.345 + float(rng.uniform(-0.006, 0.006)), picket_z), (0, 0, lean)), whitewash)
     for y in (0.55, 0.985):
-        add(moved(block((2.4, 0.028, 0.012), 0.004, 3), (0, y, picket_z - 0.014)), paint)
+        add(moved(block((2.4, 0.028, 0.012), 0.004, 3), (0, y, picket_z - 0.014)), whitewash)
 
     area = (-6.0, wall_z, 6.0, 0.4)
     paving = checker(rng, (1200, 2400), (12, 24), ("#a89f8d", "#958c7b"))
-    nodes.append(_floor(paving, area, light, casters, softness_m=0.04))
+    nodes.append(floor(paving, area, light, casters, softness_m=0.04))
     return Scene(
         "fence",
-        _merged(nodes),
-        camera=_camera((0.0, 1.12, 0.0), (0.1, 1.08, -5.0), 33.0, 0.2),
+        merged(nodes),
+        camera=aimed_camera((0.0, 1.12, 0.0), (0.1, 1.08, -5.0), 33.0, 0.2),
         lights=light.lights(),
         ambient=light.ambient,
         background=rgb("#b9cfe0"),
@@ -369,7 +257,7 @@ def _tree(rng: np.random.Generator, x: float, z: float, tall: float) -> list[Any
 
 def _foliage() -> Scene:
     rng = np.random.default_rng(5)
-    light = _Light((0.62, -0.85, -0.5), (1.0, 0.9, 0.7), Ambient((0.36, 0.42, 0.5), (0.16, 0.19, 0.1)))
+    light = Light((0.62, -0.85, -0.5), (1.0, 0.9, 0.7), Ambient((0.36, 0.42, 0.5), (0.16, 0.19, 0.1)))
     eye = (0.0, 1.5, 0.0)
     nodes: list[Node] = []
     casters: list[Any] = []
@@ -380,28 +268,28 @@ def _foliage() -> Scene:
 
     # The birdhouse in focus, on a post.
     x, y, z = 0.07, 1.36, -3.0
-    wood = _printed(planks(rng, (256, 256), 4, ("#a8743f", "#dcb078")), 0.7)
-    red, dark = _paint("#c8402f", 0.5), _paint("#1c1512", 0.9)
+    wood = printed(planks(rng, (256, 256), 4, ("#a8743f", "#dcb078")), 0.7)
+    red, dark = paint("#c8402f", 0.5), paint("#1c1512", 0.9)
     add(moved(block((0.44, 0.4, 0.4), 0.012), (x, y, z)), wood)
     add(moved(block((0.30, 0.30, 0.395), 0.01), (x, y + 0.2, z), (0, 0, 45)), wood)
     for side in (-1, 1):
         roof = moved(block((0.44, 0.03, 0.54), 0.01), (x + side * 0.152, y + 0.29, z), (0, 0, -side * 42))
         add(roof, red)
     add(moved(ball(0.075, 32), (x, y + 0.04, z + 0.2), scale=(1, 1, 0.06)), dark)
-    add(moved(ring(0.08, 0.012, 48, 12), (x, y + 0.04, z + 0.205), (90, 0, 0)), _paint("#efe3c8", 0.5))
-    add(pipe([(x, y - 0.1, z + 0.19), (x, y - 0.1, z + 0.33)], 0.011, 12), _paint("#efe3c8", 0.5))
+    add(moved(ring(0.08, 0.012, 48, 12), (x, y + 0.04, z + 0.205), (90, 0, 0)), paint("#efe3c8", 0.5))
+    add(pipe([(x, y - 0.1, z + 0.19), (x, y - 0.1, z + 0.33)], 0.011, 12), paint("#efe3c8", 0.5))
     add(moved(block((0.52, 0.03, 0.5), 0.01), (x, y - 0.21, z)), red)
-    post = _printed(planks(rng, (128, 512), 1, ("#6d5136", "#9a7a52")), 0.8)
+    post = printed(planks(rng, (128, 512), 1, ("#6d5136", "#9a7a52")), 0.8)
     add(pipe([(x, 0.0, z), (x, y - 0.2, z)], 0.045, 20), post)
     # A bird on the perch.
-    blue, cream = _paint("#2f78c4", 0.5), _paint("#f0c27a", 0.6)
+    blue, cream = paint("#2f78c4", 0.5), paint("#f0c27a", 0.6)
     bx, by, bz = x + 0.005, y - 0.045, z + 0.31
     add(moved(ball(0.045, 28), (bx, by, bz), (0, 25, 20), (1.3, 0.95, 0.9)), blue)
     add(moved(ball(0.036, 28), (bx - 0.008, by - 0.012, bz + 0.016), (0, 25, 20), (1.15, 0.85, 0.8)), cream)
     add(moved(ball(0.03, 24), (bx + 0.05, by + 0.045, bz + 0.004)), blue)
     add(
         moved(lathe([(0, 0), (0.009, 0), (0, 0.028)], 12), (bx + 0.077, by + 0.044, bz + 0.01), (0, 0, -90)),
-        _paint("#e8a33a"),
+        paint("#e8a33a"),
     )
     add(moved(ball(0.005, 10), (bx + 0.064, by + 0.054, bz + 0.024)), dark)
     add(moved(block((0.09, 0.012, 0.03), 0.005), (bx - 0.085, by - 0.012, bz), (0, 25, 18)), blue)
@@ -416,28 +304,28 @@ def _foliage() -> Scene:
     )  # fmt: skip
     for i, (tx, tz, tall) in enumerate(trees.tolist()):
         trunk, crown = _tree(rng, tx, tz, tall)
-        add(trunk, _paint("#5a4230", 0.9))
-        add(crown, _paint(crowns[i % len(crowns)], 0.9))
+        add(trunk, paint("#5a4230", 0.9))
+        add(crown, paint(crowns[i % len(crowns)], 0.9))
     petals = ["#f3d34a", "#e9e4f0", "#d9567c", "#8d6fc4", "#ef8b3b"]
     for i in range(90):
         fz = -3.6 - 8.5 * float(rng.random()) ** 1.4
         fx = float(rng.uniform(-0.42, 0.42)) * -fz * 1.6
         tall = float(rng.uniform(0.18, 0.42))
-        add(pipe([(fx, 0, fz), (fx + 0.02, tall, fz)], 0.006, 5), _paint("#5c8a3d", 0.8))
-        add(moved(ball(0.055, 12), (fx + 0.02, tall, fz), scale=(1, 0.6, 1)), _paint(petals[i % 5], 0.7))
+        add(pipe([(fx, 0, fz), (fx + 0.02, tall, fz)], 0.006, 5), paint("#5c8a3d", 0.8))
+        add(moved(ball(0.055, 12), (fx + 0.02, tall, fz), scale=(1, 0.6, 1)), paint(petals[i % 5], 0.7))
 
     haze = rgb("#dfe6e4")
     fade = (haze, eye, 12.0, 70.0)
     grass = speckle(rng, (1400, 1400), "#6f8f3f", "#93a951", 40.0) * (
         0.7 + 0.6 * noise(rng, 1400, 1400, 300, 2)[..., None]
     )
-    nodes.append(_floor(grass, (-20.0, -34.0, 20.0, 0.0), light, casters, fade=fade, softness_m=0.1))
+    nodes.append(floor(grass, (-20.0, -34.0, 20.0, 0.0), light, casters, fade=fade, softness_m=0.1))
     far_grass = speckle(rng, (512, 1024), "#6f8f3f", "#93a951", 40.0)
-    nodes.append(_floor(far_grass, (-90.0, -100.0, 90.0, -34.0), light, (), fade=fade))
+    nodes.append(floor(far_grass, (-90.0, -100.0, 90.0, -34.0), light, (), fade=fade))
 
     # Branches with leaves right before the lens.
     leafy = [
-        _leaf_material(rng, a, b) for a, b in (("#3d7a34", "#a5cf72"), ("#5d8f34", "#cfe08a"), ("#7f9a35", "#e3e09a"))
+        leaf_material(rng, a, b) for a, b in (("#3d7a34", "#a5cf72"), ("#5d8f34", "#cfe08a"), ("#7f9a35", "#e3e09a"))
     ]
     bunches: list[list[Any]] = [[], [], []]
     bark = []
@@ -462,17 +350,17 @@ def _foliage() -> Scene:
             heading = 0.0 if end[0] > start[0] else 180.0
             turn = (turn[0] + 65.0, turn[1] * 0.4 + heading, turn[2])
             bunches[k % 3].append(moved(leaf(length, 0.5 * length, steps=8), tuple(root.tolist()), turn))
-    nodes.append(Node(merge(bark), material=_paint("#5b4332", 0.8)))
+    nodes.append(Node(merge(bark), material=paint("#5b4332", 0.8)))
     nodes += [Node(merge(bunch), material=material) for bunch, material in zip(bunches, leafy, strict=True)]
 
     top = rgb("#86b2d6")
     return Scene(
         "foliage",
-        _merged(nodes),
-        camera=_camera(eye, (0.0, 1.49, -3.0), 31.0, 0.2),
+        merged(nodes),
+        camera=aimed_camera(eye, (0.0, 1.49, -3.0), 31.0, 0.2),
         lights=light.lights(),
         ambient=light.ambient,
-        background=Gradient(top=top, bottom=_mirrored(haze, top)),
+        background=Gradient(top=top, bottom=mirrored(haze, top)),
         focus_distance_m=2.8,
         aperture_radius_m=0.0125,
     )
@@ -526,7 +414,7 @@ def _chessman(kind: str) -> Any:
 
 def _tabletop() -> Scene:
     rng = np.random.default_rng(42)
-    light = _Light((0.6, -1.0, -0.25), (0.72, 0.62, 0.47), Ambient((0.26, 0.25, 0.27), (0.2, 0.13, 0.08)))
+    light = Light((0.6, -1.0, -0.25), (0.72, 0.62, 0.47), Ambient((0.26, 0.25, 0.27), (0.2, 0.13, 0.08)))
     nodes: list[Node] = []
     casters: list[Any] = []
     cell, board_y = 0.05, 0.016
@@ -550,8 +438,8 @@ def _tabletop() -> Scene:
     board = checker(rng, (1536, 1536), (8, 8), ("#e0bd87", "#7a4526"))
     grain = planks(rng, (1536, 1536), 8, ("#c9c9c9", "#ffffff"))
     area = (-4 * cell, nearest - 8 * cell, 4 * cell, nearest)
-    nodes.append(_floor(board * grain, area, light, casters, height=board_y, softness_m=0.003))
-    frame = _printed(planks(rng, (64, 512), 1, ("#4a2716", "#7b4526")), 0.35)
+    nodes.append(floor(board * grain, area, light, casters, height=board_y, softness_m=0.003))
+    frame = printed(planks(rng, (64, 512), 1, ("#4a2716", "#7b4526")), 0.35)
     border = 0.026
     for dx, dz, size in (
         (0, 4 * cell + border / 2, (8 * cell + 2 * border, 0.02, border)),
@@ -563,20 +451,20 @@ def _tabletop() -> Scene:
         nodes.append(Node(rim, material=frame))
         casters.append(rim)
     table = planks(rng, (1024, 2048), 9, ("#5d3b22", "#a87443"))
-    nodes.append(_floor(table, (-1.6, -1.45, 1.6, -0.05), light, casters, softness_m=0.006))
+    nodes.append(floor(table, (-1.6, -1.45, 1.6, -0.05), light, casters, softness_m=0.006))
     # A dim room behind: a wall, a shelf of books, and strings of lamps far brighter than white.
     wall = speckle(rng, (256, 512), "#2b3440", "#37424f", 6.0)
     wall *= np.linspace(1.25, 0.5, 256, dtype=np.float32)[:, None, None]
-    nodes.append(Node(quad((-3.4, -1.2, -3.6), (6.8, 0, 0), (0, 3.6, 0)), material=_printed(wall, unlit=True)))
+    nodes.append(Node(quad((-3.4, -1.2, -3.6), (6.8, 0, 0), (0, 3.6, 0)), material=printed(wall, unlit=True)))
     spines = ["#7d2f2a", "#2f5a66", "#a5793a", "#47603f", "#5b4370", "#8b8171", "#27405f"]
     x = -1.5
     while x < 1.5:
         wide, tall = float(rng.uniform(0.035, 0.08)), float(rng.uniform(0.3, 0.46))
         book = moved(block((wide - 0.004, tall, 0.25), 0.006, 2), (x + wide / 2, -0.28 + tall / 2, -3.2))
-        nodes.append(Node(book, material=_paint(spines[int(rng.integers(7))], 0.8)))
+        nodes.append(Node(book, material=paint(spines[int(rng.integers(7))], 0.8)))
         x += wide
-    nodes.append(Node(moved(block((3.4, 0.05, 0.34), 0.01), (0, -0.305, -3.2)), material=_paint("#4a3222", 0.6)))
-    lamp, glows = ball(0.017, 16), [_glow("#ffb057", 14.0), _glow("#ffd9a0", 17.0), _glow("#ff7a4a", 11.0)]
+    nodes.append(Node(moved(block((3.4, 0.05, 0.34), 0.01), (0, -0.305, -3.2)), material=paint("#4a3222", 0.6)))
+    lamp, glows = ball(0.017, 16), [glow("#ffb057", 14.0), glow("#ffd9a0", 17.0), glow("#ff7a4a", 11.0)]
     for string, (sag, top, depth) in enumerate(((0.16, 0.40, -2.9), (0.18, 0.26, -2.3), (0.12, 0.62, -3.2))):
         for k in range(15):
             u = (k + 0.5 * (string % 2)) / 14 - 0.5
@@ -584,8 +472,8 @@ def _tabletop() -> Scene:
             nodes.append(Node(moved(lamp, spot), material=glows[(k + string) % 3]))
     return Scene(
         "tabletop",
-        _merged(nodes),
-        camera=_camera((-0.05, 0.165, 0.0), (0.012, 0.092, -0.5), 30.0, 0.08),
+        merged(nodes),
+        camera=aimed_camera((-0.05, 0.165, 0.0), (0.012, 0.092, -0.5), 30.0, 0.08),
         lights=(*light.lights(), PointLight((0.5, 0.6, -1.3), (0.30, 0.17, 0.07))),
         ambient=light.ambient,
         background=rgb("#141a22"),
@@ -596,7 +484,7 @@ def _tabletop() -> Scene:
 
 def _glass() -> Scene:
     rng = np.random.default_rng(8)
-    light = _Light((-0.4, -1.0, -0.55), (0.72, 0.69, 0.62), Ambient((0.56, 0.56, 0.58), (0.46, 0.42, 0.37)))
+    light = Light((-0.4, -1.0, -0.55), (0.72, 0.69, 0.62), Ambient((0.56, 0.56, 0.58), (0.46, 0.42, 0.37)))
     nodes: list[Node] = []
     casters: list[Any] = []
 
@@ -608,8 +496,8 @@ def _glass() -> Scene:
     wall_z = -7.0
     plaster = speckle(rng, (700, 1600), "#dcd8d0", "#e9e5dd", 9.0)
     plaster *= np.linspace(0.92, 1.0, 700, dtype=np.float32)[:, None, None]
-    add(quad((-8.0, 0, wall_z), (16, 0, 0), (0, 5.0, 0)), _printed(plaster, 0.95), casts=False)
-    add(moved(block((16.0, 0.14, 0.05), 0.01), (0, 0.07, wall_z + 0.02)), _paint("#f2efe8", 0.5))
+    add(quad((-8.0, 0, wall_z), (16, 0, 0), (0, 5.0, 0)), printed(plaster, 0.95), casts=False)
+    add(moved(block((16.0, 0.14, 0.05), 0.01), (0, 0.07, wall_z + 0.02)), paint("#f2efe8", 0.5))
     inks = [
         ("#f3ead7", "#d1495b", "#edae49", "#00798c", "#30638e"),
         ("#1d3557", "#e63946", "#f1faee", "#a8dadc", "#ffb703"),
@@ -618,17 +506,17 @@ def _glass() -> Scene:
     ]
     for i, x in enumerate((-2.05, -0.68, 0.68, 2.05)):
         face = poster(rng, (640, 460), inks[i], i)
-        add(quad((x - 0.5, 1.0, wall_z + 0.05), (1.0, 0, 0), (0, 1.4, 0)), _printed(face, 0.6), casts=False)
-        black = _paint("#24211f", 0.4)
+        add(quad((x - 0.5, 1.0, wall_z + 0.05), (1.0, 0, 0), (0, 1.4, 0)), printed(face, 0.6), casts=False)
+        black = paint("#24211f", 0.4)
         for dx in (-0.52, 0.52):
             add(moved(block((0.05, 1.49, 0.07), 0.008), (x + dx, 1.7, wall_z + 0.04)), black, casts=False)
         for dy in (-0.72, 0.72):
             add(moved(block((1.09, 0.05, 0.07), 0.008), (x, 1.7 + dy, wall_z + 0.04)), black, casts=False)
 
     # Plinths: one before the pane, the one in focus behind it, two farther back.
-    white = _paint("#efece6", 0.6)
+    white = paint("#efece6", 0.6)
     bronze, coral, cobalt, lime = (
-        _paint(c, r, m)
+        paint(c, r, m)
         for c, r, m in (("#b9783a", 0.35, 0.55), ("#e4604e", 0.4, 0), ("#2c62b8", 0.35, 0), ("#9bb83c", 0.5, 0))
     )
     for px, pz, tall, wide in (
@@ -650,11 +538,11 @@ def _glass() -> Scene:
         for r in range(7)
         for c in range(60)
     ]
-    printed = coverage((663, 1024), [(x, y * 663 / 1024, r) for x, y, r in dots])
-    alpha = 0.20 + 0.62 * printed
+    dotted = coverage((663, 1024), [(x, y * 663 / 1024, r) for x, y, r in dots])
+    alpha = 0.20 + 0.62 * dotted
     tint = (
-        np.array(rgb("#58b7a4"), np.float32) * (1 - printed[..., None])
-        + np.array(rgb("#f4fbfa"), np.float32) * printed[..., None]
+        np.array(rgb("#58b7a4"), np.float32) * (1 - dotted[..., None])
+        + np.array(rgb("#f4fbfa"), np.float32) * dotted[..., None]
     )
     pane = Material(
         base_color=(1.0, 1.0, 1.0, 1.0),
@@ -665,7 +553,7 @@ def _glass() -> Scene:
     )
     left = -0.5
     add(quad((left, 0.38, pane_z), (pane_w, 0, 0), (0, pane_h, 0)), pane, casts=False)
-    steel = _paint("#aeb4b8", 0.35, 0.3)
+    steel = paint("#aeb4b8", 0.35, 0.3)
     for px in (left, left + pane_w):
         add(pipe([(px, 0.0, pane_z), (px, 1.78, pane_z)], 0.018, 20), steel)
     add(pipe([(left - 0.02, 1.76, pane_z), (left + pane_w + 0.02, 1.76, pane_z)], 0.02, 20), steel)
@@ -673,11 +561,11 @@ def _glass() -> Scene:
 
     area = (-8.0, wall_z, 8.0, 0.0)
     parquet = planks(rng, (1400, 2048), 36, ("#9c7448", "#cfa877"))
-    nodes.append(_floor(parquet, area, light, casters, softness_m=0.06))
+    nodes.append(floor(parquet, area, light, casters, softness_m=0.06))
     return Scene(
         "glass",
-        _merged(nodes),
-        camera=_camera((0.0, 1.42, 0.0), (0.02, 1.24, -3.5), 33.0, 0.3),
+        merged(nodes),
+        camera=aimed_camera((0.0, 1.42, 0.0), (0.02, 1.24, -3.5), 33.0, 0.3),
         lights=light.lights(),
         ambient=light.ambient,
         background=rgb("#e8e4dc"),
@@ -706,13 +594,13 @@ def _floating() -> Scene:
         spot = (reach * math.cos(around), reach * math.sin(around), -depth)
         turn = tuple(rng.uniform(0, 360, 3).tolist())
         mesh = moved(shapes[i % len(shapes)], spot, turn, min(1.0, 0.3 + 0.2 * depth))
-        nodes.append(Node(mesh, material=_paint(colors[i % len(colors)], (0.25, 0.4, 0.6)[i % 3])))
+        nodes.append(Node(mesh, material=paint(colors[i % len(colors)], (0.25, 0.4, 0.6)[i % 3])))
     subject = moved(knot(0.34, 0.075), (0.0, 0.0, -3.0), (25, 20, 0))
-    nodes.append(Node(subject, material=_paint("#f4f1ea", 0.3)))
+    nodes.append(Node(subject, material=paint("#f4f1ea", 0.3)))
     return Scene(
         "floating",
-        _merged(nodes),
-        camera=_camera((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), 33.0, 0.3),
+        merged(nodes),
+        camera=aimed_camera((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), 33.0, 0.3),
         lights=(
             DirectionalLight((-0.5, -1.0, -0.6), (0.8, 0.77, 0.7)),
             DirectionalLight((0.8, 0.2, -0.3), (0.16, 0.2, 0.28)),

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
     "ball",
+    "band",
     "block",
     "knot",
     "lathe",
@@ -39,6 +40,19 @@ def ball(radius: float, segments: int = 48) -> Any:
     angle = np.linspace(-math.pi / 2, math.pi / 2, segments // 2 + 1)
     profile = np.stack([np.cos(angle), np.sin(angle)], axis=1) * radius
     return _revolve(profile, profile / radius, segments)
+
+
+def band(first: ArrayLike, second: ArrayLike) -> Any:
+    """The flat strip between two paths (N, 3) of one plane, facing ``along x across``: paper cut along both edges.
+
+    Parts of no width vanish. Texture coordinates run along the paths and from the first to the second.
+    """
+    a, b = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    surface = np.stack([a, b], axis=1)
+    facing = np.cross(np.gradient(a, axis=0) + np.gradient(b, axis=0), b - a).sum(axis=0)
+    normal = np.broadcast_to(facing / np.linalg.norm(facing), surface.shape)
+    uv = np.stack(np.meshgrid(np.linspace(0, 1, len(a)), np.array([0.0, 1.0]), indexing="ij"), axis=-1)
+    return _grid(surface, normal, uv)
 
 
 def block(size: Sequence[float], bevel: float, steps: int = 4) -> Any:

@@ -27,7 +27,9 @@ __all__ = [
     "rgb",
     "shadow_mask",
     "speckle",
+    "tiles",
     "veins",
+    "windows",
 ]
 
 _Array = NDArray[np.float32]
@@ -170,6 +172,48 @@ def poster(rng: np.random.Generator, size: tuple[int, int], colors: Sequence[str
                 shape(box, fill=ink[int(rng.integers(len(ink)))])
     flat = np.asarray(canvas.resize((width, height), Image.Resampling.LANCZOS), np.float32) / 255.0
     return linear_from_srgb(flat)
+
+
+def tiles(rng: np.random.Generator, count: tuple[int, int], texels: int, colors: Sequence[str]) -> _Array:
+    """Square encaustic tiles, ``count`` down and across, ``texels`` wide, each with a motif, a colour and a turn.
+
+    ``colors[0]`` is the ground, the last one the joints.
+    """
+    over = 4
+    b, a = (np.mgrid[: texels * over, : texels * over].astype(np.float32) + 0.5) / (texels * over)
+    centre, diamond = np.hypot(a - 0.5, b - 0.5), np.abs(a - 0.5) + np.abs(b - 0.5)
+    motifs = [
+        (np.abs(np.hypot(a, b) - 0.5) < 0.14) | (np.abs(np.hypot(1 - a, 1 - b) - 0.5) < 0.14),
+        (centre < 0.38) & ~((centre < 0.26) & (centre > 0.13)),
+        (diamond < 0.44) & (centre > 0.16),
+        (a + b < 1.0) ^ (diamond < 0.24),
+    ]
+    small = [m.reshape(texels, over, texels, over).mean(axis=(1, 3), dtype=np.float32) for m in motifs]
+    inside = np.stack([np.rot90(m, k) for m in small for k in range(4)])[rng.integers(0, 16, count)][..., None]
+    palette = np.array([rgb(c) for c in colors], np.float32)
+    tone = rng.uniform(0.85, 1.1, (*count, 1, 1, 1)).astype(np.float32)
+    ink = palette[rng.integers(1, len(colors) - 1, count)][:, :, None, None]
+    board = (palette[0] + (ink - palette[0]) * inside) * tone
+    gap = max(1, round(0.018 * texels))
+    for edge in (slice(0, gap), slice(-gap, None)):
+        board[:, :, edge] = board[:, :, :, edge] = palette[-1]
+    flat = board.transpose(0, 2, 1, 3, 4).reshape(count[0] * texels, count[1] * texels, 3)
+    return np.asarray(flat * (0.85 + 0.3 * noise(rng, flat.shape[0], flat.shape[1], 60.0, 3)[..., None]), np.float32)
+
+
+def windows(
+    rng: np.random.Generator, cells: tuple[int, int], wall: str, lit: Sequence[str], share: float, texels: int = 12
+) -> _Array:
+    """A building's front at night, ``cells`` windows down and across, of which ``share`` are lit."""
+    palette = np.array([rgb(c) for c in lit], np.float32)
+    on = rng.random(cells) < share
+    color = palette[rng.integers(0, len(lit), cells)] * rng.uniform(0.35, 1.0, (*cells, 1)).astype(np.float32)
+    color = np.where(on[..., None], color, 0.35 * np.array(rgb(wall), np.float32))
+    y, x = np.mgrid[: cells[0] * texels, : cells[1] * texels]
+    inside = (np.abs(y % texels / texels - 0.5) < 0.3) & (np.abs(x % texels / texels - 0.5) < 0.25)
+    return np.asarray(
+        np.where(inside[..., None], color[y // texels, x // texels], np.array(rgb(wall), np.float32)), np.float32
+    )
 
 
 def veins(rng: np.random.Generator, size: tuple[int, int], color: str, light: str) -> _Array:
