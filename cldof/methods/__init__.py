@@ -7,12 +7,14 @@ from typing import Any
 from ..errors import InputError
 from .base import FrameShape, Method, Plan
 from .layered import Layered
+from .pyramid import Pyramid
 
 __all__ = ["METHODS", "FrameShape", "Method", "Plan", "make_method"]
 
 # A new method is one line here.
 METHODS: dict[str, type[Any]] = {
     "layered": Layered,
+    "pyramid": Pyramid,
 }
 
 
