@@ -11,7 +11,7 @@ Depths and circles of confusion are those of the first peel of a frame, guard ba
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -342,8 +342,8 @@ def compare(
     lens: Lens | None = None,
     width_px: float = 2.0,
     clip: Clip = (0.0, 1.0),
-) -> dict[str, Any]:
-    """All measures of an image against its reference as plain values for JSON.
+) -> dict[str, float]:
+    """All measures of an image against its reference as plain floats.
 
     Parameters
     ----------
@@ -355,11 +355,12 @@ def compare(
 
     Returns
     -------
-    dict
-        ``psnr_db``, ``ssim``, ``rms``, ``max``, ``highlight_energy``, ``worst_tile`` (``rms``, ``x``, ``y``); with a
-        frame also ``silhouette_band_rms``, ``silhouette_band_pixels`` and ``in_focus`` (``rms``, ``max``, ``pixels``).
-        None stands for what is not a finite number: the PSNR of equal images (their ``max`` is 0), the SSIM of images
-        smaller than its window, the error of a region without pixels.
+    dict of str to float
+        ``psnr_db``, ``ssim``, ``rms``, ``max``, ``highlight_energy``, ``worst_tile_rms``, ``worst_tile_x``,
+        ``worst_tile_y``; with a frame also ``silhouette_band_rms``, ``silhouette_band_pixels``, ``in_focus_rms``,
+        ``in_focus_max``, ``in_focus_pixels``. What there is not is left out, so that all values but two are finite: the
+        SSIM of images smaller than its window, the errors of a region without pixels. The PSNR of equal images and the
+        energy of highlights that only the image has are ``inf``, which strict JSON has no word for.
 
     Raises
     ------
@@ -369,28 +370,28 @@ def compare(
         raise InputError("compare takes a frame and a lens together, or neither.")
     first, second = _pair(image, reference, clip)
     squared = np.square(first - second)
-    small = min(first.shape[:2]) < _SSIM_WINDOW
-    found: dict[str, Any] = {
+    tile = worst_tile(image, reference, clip=clip)
+    found: dict[str, float] = {
         "psnr_db": psnr(image, reference, clip),
-        "ssim": None if small else ssim(image, reference, clip),
         "rms": math.sqrt(float(squared.mean())),
         "max": math.sqrt(float(squared.max())),
         "highlight_energy": highlight_energy(image, reference),
-        "worst_tile": worst_tile(image, reference, clip=clip)._asdict(),
+        "worst_tile_rms": tile.rms,
+        "worst_tile_x": float(tile.x),
+        "worst_tile_y": float(tile.y),
     }
+    if min(first.shape[:2]) >= _SSIM_WINDOW:
+        found["ssim"] = ssim(image, reference, clip)
     if frame is not None and lens is not None:
         _check_size(squared, frame)
-        band = silhouette_band(frame, lens, width_px)
-        found["silhouette_band_rms"] = math.sqrt(float(squared[band].mean())) if band.any() else None
-        found["silhouette_band_pixels"] = int(np.count_nonzero(band))
-        found["in_focus"] = in_focus_error(image, reference, frame, lens, clip)._asdict()
-    return {name: _plain(value) for name, value in found.items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(each) for name, each in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        band, region = silhouette_band(frame, lens, width_px), in_focus_region(frame, lens)
+        for name, mask in (("silhouette_band", band), ("in_focus", region)):
+            found[f"{name}_pixels"] = float(np.count_nonzero(mask))
+            if mask.any():
+                found[f"{name}_rms"] = math.sqrt(float(squared[mask].mean()))
+        if region.any():
+            found["in_focus_max"] = math.sqrt(float(squared[region].max()))
+    return found
 
 
 def _peak(clip: Clip) -> float:
