@@ -1,4 +1,4 @@
-"""The command line: ``cldof render``, ``cldof devices``, ``cldof scenes``.
+"""The command line: ``cldof render``, ``cldof methods``, ``cldof scenes``, ``cldof devices``.
 
 Everything heavy is imported by the command that needs it, so that ``cldof --help`` answers at once. Mistakes in the
 input, a machine that lacks something and results that cannot be written end with one paragraph on stderr and exit
@@ -13,6 +13,7 @@ import json
 import math
 import platform
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,9 +29,12 @@ from .camera import Camera
 from .errors import CldofError, DeviceError, FrameError, InputError, SceneError
 from .files import atomic_write
 from .frame import LayeredFrame
-from .lens import Lens
+from .lens import Aperture, DiscAperture, GaussianAperture, ImageAperture, Lens, PolygonAperture
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .capture.peel import DepthPeeler
     from .capture.scene import Scene
 
 __all__ = ["main"]
@@ -40,6 +44,9 @@ _EXIT_INTERRUPTED = 130
 
 _DEFAULT_SIZE = (1024, 1024)
 _DEFAULT_PEELS = 4
+# The reference by brute force (capture/accumulate.py) is asked for like a method; it needs no OpenCL.
+_ACCUMULATE = "accumulate"
+_DEFAULT_VIEWS = 64
 # An aperture of our choosing gives this largest CoC radius, as a share of the image height: clearly seen, not garish.
 # A sky may blur more, since it rarely shows, but not without bound, since it still costs.
 _AUTO_COC_SHARE = 0.02
@@ -51,6 +58,8 @@ _PREVIEW_SHRINK = 4
 _PREVIEW_LAYERS = 2
 _FULL_FRAME_HEIGHT_MM = 24.0
 _PATIENCE_S = 2.0
+# Steps of so many parts or more get a bar.
+_BAR_FROM, _BAR_WIDTH = 16, 30
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -101,6 +110,10 @@ def _parser() -> argparse.ArgumentParser:
     view.add_argument("--unlit", action="store_true", help="show base colours without any light")
     view.add_argument("--transparent", action="store_true", help="leave out the background; alpha tells where it was")
     view.add_argument("--peels", type=int, metavar="N", help=f"layers to capture at most (default {_DEFAULT_PEELS})")
+    view.add_argument(
+        "--azimuth", type=_number, metavar="DEG", help="see files without a camera from here, +z to +x (default 30)"
+    )
+    view.add_argument("--elevation", type=_number, metavar="DEG", help="and from this far up (default 14)")
 
     lens = render.add_argument_group("lens")
     opening = lens.add_mutually_exclusive_group()
@@ -118,9 +131,39 @@ def _parser() -> argparse.ArgumentParser:
     focus.add_argument("--focus-distance", type=_number, metavar="M", help="planar distance in metres; inf is legal")
     focus.add_argument("--focus-at", type=_pixel, metavar="X,Y", help="focus on what is seen at this pixel")
 
+    lens.add_argument(
+        "--aperture",
+        metavar="SHAPE",
+        help="disc, gaussian, polygon:BLADES[:ROTATION_DEG[:CURVATURE]] or image:FILE; for --method accumulate",
+    )
+    lens.add_argument("--anamorphic", type=_number, metavar="RATIO", help="height over width of that shape (default 1)")
+
     how = render.add_argument_group("how")
-    how.add_argument("--method", default="layered", help="depth-of-field method (default layered)")
+    how.add_argument("--method", default="layered", help="a name from 'cldof methods' (default layered)")
     how.add_argument("--device", metavar="DEVICE", help="OpenCL device: index or part of a name from 'cldof devices'")
+    how.add_argument(
+        "--supersample", type=int, metavar="N", help="capture N times larger and scale down after the blur (default 1)"
+    )
+    how.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="an option of the method; see 'cldof methods'",
+    )
+    how.add_argument("--layers", metavar="K", help="the most depth layers; short for --option layers=K")
+    how.add_argument("--sigma-step", metavar="PX", help="short for --option sigma_step=PX")
+    how.add_argument("--no-cascade", action="store_true", help="short for --option cascade=false")
+    how.add_argument("--engine", metavar="NAME", help="short for --option engine=NAME")
+
+    brute = render.add_argument_group("--method accumulate: many views through the lens, averaged")
+    brute.add_argument("--views", type=int, metavar="N", help=f"how many (default {_DEFAULT_VIEWS})")
+    brute.add_argument(
+        "--jitter",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="also move them inside the pixel, for smooth edges (default); not to compare with a method pixel by pixel",
+    )
 
     more = render.add_argument_group("further results")
     more.add_argument("--pinhole", metavar="FILE", help="also save the image without any blur")
@@ -128,6 +171,10 @@ def _parser() -> argparse.ArgumentParser:
     more.add_argument("--report", metavar="FILE", help="also save lens, camera, device, plan and times as JSON")
     more.add_argument("--quiet", action="store_true", help="print errors only")
 
+    methods = commands.add_parser(
+        "methods", help="list methods and their options", description="List methods and their options."
+    )
+    methods.set_defaults(run=_methods)
     devices = commands.add_parser("devices", help="list OpenCL devices", description="List OpenCL devices.")
     devices.set_defaults(run=_devices)
     scenes = commands.add_parser("scenes", help="list built-in scenes", description="List built-in scenes.")
@@ -175,55 +222,152 @@ def _scenes(arguments: argparse.Namespace) -> None:
 
     scenes = builtin_scenes()
     width = max(map(len, scenes))
+    group = None
     for name, scene in scenes.items():
-        print(f"{name:{width}}  {scene.description}")
+        if scene.group != group:
+            print(("" if group is None else "\n") + f"{scene.group}:")
+            group = scene.group
+        print(f"  {name:{width}}  {scene.description}")
+
+
+def _methods(arguments: argparse.Namespace) -> None:
+    from .method_options import about, options_of, simulated_aperture
+    from .methods import METHODS
+
+    def show(name: str, default: str, text: str) -> None:
+        print(
+            textwrap.fill(f"{name} (default {default}): {text}", 100, initial_indent="  ", subsequent_indent="      ")
+        )
+
+    for method in METHODS:
+        print(textwrap.fill(f"{method}: {about(method)}", 100, subsequent_indent="  "))
+        shape = simulated_aperture(method)
+        print(f"  Simulates a {shape} lens." if shape else "  Takes --aperture.")
+        for option in options_of(method).values():
+            show(f"{option.name}={option.kind}", str(option.default), option.text)
+    print(f"{_ACCUMULATE}: the reference: many pinhole views through the lens, averaged; needs no OpenCL")
+    print("  Takes --aperture.")
+    show("--views N", str(_DEFAULT_VIEWS), "more views, less noise; the noise that is left is printed")
+    show("--jitter, --no-jitter", "on", "smooth edges, as box-filtered pixels have them")
 
 
 def _render(arguments: argparse.Namespace) -> None:
     from .images import check_writable, save_image
-    from .renderer import Renderer
 
     output = check_writable(arguments.output)
     pinhole = check_writable(arguments.pinhole) if arguments.pinhole else None
     saved_frame = check_writable(arguments.save_frame, (".npz",)) if arguments.save_frame else None
     report = check_writable(arguments.report, ()) if arguments.report else None
     _check_options(arguments)
+    settings = _Settings(_method_options(arguments), _aperture(arguments))
 
     watch = _Stopwatch(quiet=arguments.quiet)
     with ExitStack() as stack:
-        with watch.step("device"):
-            renderer = stack.enter_context(Renderer(method=arguments.method, device=arguments.device, profile=True))
-        shot = _load_shot(arguments) if _is_saved_frame(arguments.scene) else _capture_shot(arguments, watch)
-        with watch.step("render"):
-            result = renderer.render(shot.frame, shot.lens)
-
-        facts = _facts(arguments, shot, result, renderer)
+        make = _accumulated if arguments.method == _ACCUMULATE else _rendered
+        shot, picture = make(arguments, settings, watch, stack)
+        facts = _facts(arguments, shot, picture)
         with watch.step("write"):
             if pinhole is not None:
-                save_image(pinhole, shot.frame.pinhole_image(), {**facts, "method": "pinhole", "lens": None})
+                save_image(pinhole, picture.pinhole(), {**facts, "method": "pinhole", "settings": {}, "lens": None})
             if saved_frame is not None:
                 shot.frame.save(saved_frame)
-            save_image(output, result.image, facts)
-        passes = [{"label": timing.label, "ms": timing.ms} for timing in result.timings]
+            save_image(output, picture.image, facts)
+        passes = [{"label": timing.label, "ms": timing.ms} for timing in picture.timings]
         if report is not None:
             details = {
                 **facts,
                 "output": str(output),
-                "plan": _plain(result.plan.summary),
+                "plan": _plain(picture.plan),
                 "timings": {"steps_s": watch.seconds, "passes_ms": passes},
                 "versions": _versions(),
             }
             with atomic_write(report) as stream:
                 stream.write(json.dumps(details, indent=2, allow_nan=False).encode() + b"\n")
     if not arguments.quiet:
-        _summarise(output, facts, shot, watch, sum(timing.ms for timing in result.timings))
+        _summarise(output, facts, shot, watch, sum(timing.ms for timing in picture.timings))
+
+
+class _Settings(NamedTuple):
+    """What was asked for beside scene, view and lens."""
+
+    options: dict[str, Any]
+    aperture: Aperture
+
+
+class _Picture(NamedTuple):
+    """What a method made of a shot."""
+
+    image: NDArray[np.float32]
+    pinhole: Callable[[], NDArray[np.float32]]
+    settings: dict[str, Any]
+    plan: Any
+    timings: list[Any]
+    device: str | None
+
+
+def _rendered(
+    arguments: argparse.Namespace, settings: _Settings, watch: _Stopwatch, stack: ExitStack
+) -> tuple[_Shot, _Picture]:
+    """Layers, and a method on them."""
+    from .renderer import Renderer
+
+    factor = 1 if arguments.supersample is None else arguments.supersample
+    with watch.step("device"):
+        renderer = stack.enter_context(
+            Renderer(arguments.method, device=arguments.device, profile=True, supersample=factor, **settings.options)
+        )
+    capture = _load_shot if _is_saved_frame(arguments.scene) else _capture_shot
+    shot = capture(arguments, settings, factor, watch)
+    with watch.step("render"):
+        result = renderer.render(shot.frame, shot.lens)
+
+    def pinhole() -> NDArray[np.float32]:
+        sharp = shot.frame.pinhole_image()
+        height, width = result.image.shape[:2]
+        boxes = sharp.reshape(height, factor, width, factor, 4)
+        return np.asarray(boxes.mean(axis=(1, 3), dtype=np.float64), np.float32) if factor > 1 else sharp
+
+    asked = {"supersample": factor, **_plain(renderer.method)}
+    device = str(renderer.device.info)
+    return shot, _Picture(result.image, pinhole, asked, result.plan.summary, result.timings, device)
+
+
+def _accumulated(
+    arguments: argparse.Namespace, settings: _Settings, watch: _Stopwatch, stack: ExitStack
+) -> tuple[_Shot, _Picture]:
+    """The reference by brute force, which needs no OpenCL."""
+    from .capture.accumulate import accumulate
+    from .capture.peel import DepthPeeler
+
+    views = _DEFAULT_VIEWS if arguments.views is None else arguments.views
+    jitter = True if arguments.jitter is None else arguments.jitter
+    with watch.step("scene"):
+        scene = _scene(arguments)
+    camera = _camera(arguments, scene)
+    peeler = stack.enter_context(DepthPeeler(camera.width, camera.height))
+    preview, lens, remarks = _aimed(arguments, settings, peeler, scene, camera, watch)
+    with watch.step(_ACCUMULATE) as progress:
+        reference = accumulate(peeler, scene, camera, lens, views, jitter=jitter, progress=progress)
+
+    def pinhole() -> NDArray[np.float32]:
+        closed = dataclasses.replace(lens, aperture_radius_m=0.0)
+        return accumulate(peeler, scene, camera, closed, views, jitter=jitter, noise_floor=False).image
+
+    facts = reference.to_dict()
+    floor = facts["noise_floor_db"]
+    if floor is not None:
+        remarks.append(f"noise floor {floor:.1f} dB: the PSNR of this image against endlessly many views")
+    asked = {"views": views, "jitter": jitter, "seed": 0}
+    shot = _Shot(preview, lens, camera, remarks, peeler.device)
+    return shot, _Picture(reference.image, pinhole, asked, {"method": _ACCUMULATE, **facts}, [], None)
 
 
 class _Shot(NamedTuple):
-    """A frame to render, the lens to render it with, and remarks for the user."""
+    """A frame to render, the lens and the image's camera to render it with, and remarks for the user."""
 
     frame: LayeredFrame
     lens: Lens
+    camera: Camera
     remarks: list[str]
     capture_device: str | None
 
@@ -232,45 +376,153 @@ def _is_saved_frame(scene: str) -> bool:
     return Path(scene).suffix.lower() == ".npz"
 
 
+def _flags(arguments: argparse.Namespace, *names: str) -> list[str]:
+    """Those of the options that were given, as they are typed."""
+    given = {name: getattr(arguments, name) for name in names}
+    if given.get("jitter") is False:
+        given = {"no-jitter" if name == "jitter" else name: value is not None for name, value in given.items()}
+    # By identity: 0 is a value.
+    return [
+        "--" + name.replace("_", "-")
+        for name, value in given.items()
+        if not (value is None or value is False or value == [])
+    ]
+
+
 def _check_options(arguments: argparse.Namespace) -> None:
     if arguments.focal_length is not None and arguments.f_number is None and arguments.aperture_radius is None:
         raise InputError("--focal-length alone does not say how wide the lens is open; give --f-number with it.")
+    if arguments.supersample is not None and arguments.supersample < 1:
+        raise InputError(f"--supersample is {arguments.supersample}; it must be a whole number, at least 1.")
+    if arguments.method == _ACCUMULATE:
+        if _is_saved_frame(arguments.scene):
+            raise InputError(
+                f"{arguments.scene} is a captured frame; --method accumulate draws the scene itself, so give that."
+            )
+        given = _flags(
+            arguments, "device", "supersample", "option", "layers", "sigma_step", "no_cascade", "engine", "peels",
+            "save_frame",
+        )  # fmt: skip
+        if given:
+            raise InputError(
+                f"--method accumulate captures no layers and takes no options of methods; leave out {', '.join(given)}."
+            )
+    else:
+        given = _flags(arguments, "views", "jitter")
+        if given:
+            raise InputError(f"{', '.join(given)}: for --method accumulate only, not for {arguments.method!r}.")
+    if arguments.camera and (given := _flags(arguments, "azimuth", "elevation")):
+        raise InputError(f"--camera says where to look from; leave out {', '.join(given)}.")
     if _is_saved_frame(arguments.scene):
-        names = ("size", "yfov", "camera", "unlit", "transparent", "peels", "save_frame")
-        given = ["--" + name.replace("_", "-") for name in names if getattr(arguments, name)]
+        given = _flags(
+            arguments, "size", "yfov", "camera", "unlit", "transparent", "peels", "save_frame", "azimuth", "elevation"
+        )
         if given:
             raise InputError(
                 f"{arguments.scene} is a captured frame with a view of its own; leave out {', '.join(given)}."
             )
 
 
-def _load_shot(arguments: argparse.Namespace) -> _Shot:
+def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The method's options, from --option and the flags that are short for it; checks the method's name too."""
+    if arguments.method == _ACCUMULATE:
+        return {}
+    from .method_options import parse_options
+    from .methods import METHODS
+
+    if arguments.method not in METHODS:
+        known = ", ".join([*METHODS, _ACCUMULATE])
+        raise InputError(f"Method {arguments.method!r} is unknown; choose one of {known}.")
+    pairs = []
+    for text in arguments.option:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InputError(f"--option {text!r} is not NAME=VALUE, such as layers=12.")
+        pairs.append((name, value))
+    pairs += [
+        (name, getattr(arguments, name))
+        for name in ("layers", "sigma_step", "engine")
+        if getattr(arguments, name) is not None
+    ]
+    if arguments.no_cascade:
+        pairs.append(("cascade", "false"))
+    return parse_options(arguments.method, pairs)
+
+
+def _aperture(arguments: argparse.Namespace) -> Aperture:
+    """The shape of the aperture: the one asked for, or the one that the method simulates."""
+    if arguments.method != _ACCUMULATE:
+        from .method_options import simulated_aperture
+
+        simulated = simulated_aperture(arguments.method)
+        given = _flags(arguments, "aperture", "anamorphic")
+        if simulated is not None:
+            if given:
+                raise InputError(
+                    f"Method {arguments.method!r} simulates a {simulated} lens and no other; leave out "
+                    f"{', '.join(given)}, or use --method accumulate."
+                )
+            return Aperture.of(simulated)
+    ratio = 1.0 if arguments.anamorphic is None else arguments.anamorphic
+    kind, colon, rest = (arguments.aperture or "disc").partition(":")
+    if kind == "disc" and not colon:
+        return DiscAperture(ratio=ratio)
+    if kind == "gaussian" and not colon:
+        return GaussianAperture(ratio=ratio)
+    if kind == "image" and rest:
+        return ImageAperture(_aperture_image(rest), ratio=ratio)
+    if kind == "polygon" and rest.count(":") <= 2:
+        blades, *others = rest.split(":")
+        try:
+            corners, (rotation, curvature) = int(blades), [*(float(value) for value in others), 0.0, 0.0][:2]
+        except ValueError:
+            pass
+        else:
+            return PolygonAperture(corners, rotation, curvature, ratio=ratio)
+    raise InputError(
+        f"--aperture {arguments.aperture!r} is unknown; use disc, gaussian, polygon:BLADES[:ROTATION_DEG[:CURVATURE]] "
+        "such as polygon:6:15:0.2, or image:FILE."
+    )
+
+
+def _aperture_image(path: str) -> NDArray[np.float64]:
+    """How much light each point of the aperture lets through: the linear luminance of a picture, on black."""
+    from PIL import Image
+
+    from .images import linear_from_srgb
+
+    try:
+        with Image.open(path) as picture:
+            flat = np.asarray(picture.convert("RGBA"), np.float64) / 255.0
+    except (OSError, ValueError, SyntaxError) as error:
+        raise InputError(f"Cannot read the aperture image {path}: {error}.") from error
+    return np.asarray(linear_from_srgb(flat[..., :3]) @ (0.2126, 0.7152, 0.0722) * flat[..., 3])
+
+
+def _load_shot(arguments: argparse.Namespace, settings: _Settings, factor: int, watch: _Stopwatch) -> _Shot:
     frame = LayeredFrame.load(arguments.scene)
-    lens, remarks = _choose_lens(arguments, frame, frame.camera, None)
-    needed = math.ceil(_largest_coc_px(lens, frame.camera, frame))
+    captured = frame.camera
+    camera = dataclasses.replace(
+        captured, width=max(1, captured.width // factor), height=max(1, captured.height // factor)
+    )
+    lens, remarks = _choose_lens(arguments, settings, frame, camera, None)
+    needed = math.ceil(_largest_coc_px(lens, captured, frame))
     if frame.guard_px < needed:
         remarks.append(
             f"the frame's guard band is {frame.guard_px} px, the largest blur radius {needed} px: light from beyond "
             "the edges is missing there"
         )
-    return _Shot(frame, lens, remarks, None)
+    return _Shot(frame, lens, camera, remarks, None)
 
 
-def _capture_shot(arguments: argparse.Namespace, watch: _Stopwatch) -> _Shot:
+def _capture_shot(arguments: argparse.Namespace, settings: _Settings, factor: int, watch: _Stopwatch) -> _Shot:
     from .capture.peel import DepthPeeler
 
     with watch.step("scene"):
         scene = _scene(arguments)
     camera = _camera(arguments, scene)
     with DepthPeeler(camera.width, camera.height) as peeler:
-        with watch.step("preview"):
-            # On a pixel the depth has to be that pixel's own; for anything else a fraction of them is enough.
-            shrink = 1 if arguments.focus_at else _PREVIEW_SHRINK
-            small = dataclasses.replace(
-                camera, width=math.ceil(camera.width / shrink), height=math.ceil(camera.height / shrink)
-            )
-            preview = peeler.peel(scene, small, layers=_PREVIEW_LAYERS)
-        lens, remarks = _choose_lens(arguments, preview, camera, scene)
+        preview, lens, remarks = _aimed(arguments, settings, peeler, scene, camera, watch)
         needed = math.ceil(_largest_coc_px(lens, camera, preview))
         guard = min(needed, math.ceil(_GUARD_SHARE * max(camera.width, camera.height)))
         if guard < needed:
@@ -279,15 +531,36 @@ def _capture_shot(arguments: argparse.Namespace, watch: _Stopwatch) -> _Shot:
                 "the edges is missing there"
             )
         peels = _DEFAULT_PEELS if arguments.peels is None else arguments.peels
+        large = camera.supersampled(factor)
         with watch.step("capture") as progress:
-            frame = peeler.peel(scene, camera, layers=peels, lens=lens, guard_px=guard, progress=progress)
-        return _Shot(frame, lens, remarks, peeler.device)
+            frame = peeler.peel(scene, large, layers=peels, lens=lens, guard_px=factor * guard, progress=progress)
+        return _Shot(frame, lens, camera, remarks, peeler.device)
+
+
+def _aimed(
+    arguments: argparse.Namespace,
+    settings: _Settings,
+    peeler: DepthPeeler,
+    scene: Scene,
+    camera: Camera,
+    watch: _Stopwatch,
+) -> tuple[LayeredFrame, Lens, list[str]]:
+    """A first look at the scene, and the lens that follows from it."""
+    with watch.step("preview"):
+        # On a pixel the depth has to be that pixel's own; for anything else a fraction of them is enough.
+        shrink = 1 if arguments.focus_at else _PREVIEW_SHRINK
+        small = dataclasses.replace(
+            camera, width=math.ceil(camera.width / shrink), height=math.ceil(camera.height / shrink)
+        )
+        preview = peeler.peel(scene, small, layers=_PREVIEW_LAYERS)
+    return preview, *_choose_lens(arguments, settings, preview, camera, scene)
 
 
 def _scene(arguments: argparse.Namespace) -> Scene:
     from .capture.scenes import builtin_scenes
 
     builtin = builtin_scenes()
+    turned = _flags(arguments, "azimuth", "elevation")
     if arguments.scene in builtin:
         scene = builtin[arguments.scene].make()
         if arguments.unlit:
@@ -299,7 +572,13 @@ def _scene(arguments: argparse.Namespace) -> Scene:
     else:
         from .capture.load import load_scene
 
-        scene = load_scene(arguments.scene, unlit=arguments.unlit)
+        view = {f"{name}_deg": getattr(arguments, name) for name in ("azimuth", "elevation")}
+        view = {name: angle for name, angle in view.items() if angle is not None}
+        if not all(map(math.isfinite, view.values())):
+            raise InputError(f"{' and '.join(turned)}: angles must be finite.")
+        scene = load_scene(arguments.scene, unlit=arguments.unlit, **view)
+    if turned and scene.camera is not None:
+        raise InputError(f"{arguments.scene} has a camera of its own; leave out {', '.join(turned)}, or use --camera.")
     return dataclasses.replace(scene, background=None) if arguments.transparent else scene
 
 
@@ -325,7 +604,7 @@ def _sized(path: str, width: int | None, height: int | None) -> tuple[int | None
 
 
 def _choose_lens(
-    arguments: argparse.Namespace, frame: LayeredFrame, camera: Camera, scene: Scene | None
+    arguments: argparse.Namespace, settings: _Settings, frame: LayeredFrame, camera: Camera, scene: Scene | None
 ) -> tuple[Lens, list[str]]:
     """The lens asked for, completed from the scene's suggestions or from what the frame shows."""
     remarks: list[str] = []
@@ -347,14 +626,14 @@ def _choose_lens(
         if focal is None:
             focal = _FULL_FRAME_HEIGHT_MM / 2.0 / math.tan(math.radians(camera.yfov_deg) / 2.0)
             remarks.append(f"focal length {focal:.4g} mm, which gives this view on a sensor 24 mm high")
-        return Lens.photographic(focal, arguments.f_number, focus), remarks
+        return Lens.photographic(focal, arguments.f_number, focus, settings.aperture), remarks
     if arguments.aperture_radius is not None:
-        return Lens(arguments.aperture_radius, focus, arguments.focal_length), remarks
+        return Lens(arguments.aperture_radius, focus, arguments.focal_length, settings.aperture), remarks
     if scene is not None and scene.aperture_radius_m is not None:
-        return Lens(scene.aperture_radius_m, focus), remarks
+        return Lens(scene.aperture_radius_m, focus, aperture=settings.aperture), remarks
     radius = _default_aperture_m(frame, camera, focus)
     remarks.append(f"aperture radius {radius:.4g} m, for a visible blur (--aperture-radius or --f-number sets another)")
-    return Lens(radius, focus), remarks
+    return Lens(radius, focus, aperture=settings.aperture), remarks
 
 
 def _depth_at(frame: LayeredFrame, camera: Camera, pixel: tuple[float, float]) -> float:
@@ -363,8 +642,11 @@ def _depth_at(frame: LayeredFrame, camera: Camera, pixel: tuple[float, float]) -
         raise InputError(
             f"--focus-at {x:g},{y:g} is outside the image of {camera.width}x{camera.height} (x right, y down, from 0)."
         )
-    depth = frame.depth_at(x, y)
-    if math.isinf(depth) and frame.color[0, int(y) + frame.guard_px, int(x) + frame.guard_px, 3] == 0.0:
+    # The frame may be larger than the image.
+    scale = frame.camera.width / camera.width
+    column, row = int(x * scale), int(y * scale)
+    depth = frame.depth_at(column, row)
+    if math.isinf(depth) and frame.color[0, row + frame.guard_px, column + frame.guard_px, 3] == 0.0:
         raise InputError(f"--focus-at {x:g},{y:g}: nothing is there. Choose another pixel, or use --focus-distance.")
     return depth
 
@@ -398,46 +680,61 @@ def _largest_coc_px(lens: Lens, camera: Camera, frame: LayeredFrame) -> float:
     return max(abs(c1 * inverse + c0) for inverse in frame.inverse_depth_range)
 
 
-def _facts(arguments: argparse.Namespace, shot: _Shot, result: Any, renderer: Any) -> dict[str, Any]:
+def _facts(arguments: argparse.Namespace, shot: _Shot, picture: _Picture) -> dict[str, Any]:
     """What made the image: goes into the image file and the report."""
     frame, lens = shot.frame, shot.lens
-    c1, c0 = lens.coc_coefficients(frame.camera)
+    has_layers = arguments.method != _ACCUMULATE
+    c1, c0 = lens.coc_coefficients(shot.camera)
     low, high = frame.inverse_depth_range
     return {
         "cldof": __version__,
         "scene": Path(arguments.scene).name,
         "method": arguments.method,
+        "settings": picture.settings,
         "lens": {**lens.to_dict(), "f_number": _plain(lens.f_number)},
-        "camera": frame.camera.to_dict(),
-        "layers": frame.layer_count,
-        "guard_px": frame.guard_px,
+        "camera": shot.camera.to_dict(),
+        "layers": frame.layer_count if has_layers else None,
+        "guard_px": frame.guard_px if has_layers else None,
         "coc_radius_px": [c1 * high + c0, c1 * low + c0],
-        "device": str(renderer.device.info),
+        "device": picture.device,
         "capture_device": shot.capture_device,
         "remarks": shot.remarks,
     }
 
 
 def _summarise(output: Path, facts: dict[str, Any], shot: _Shot, watch: _Stopwatch, kernels_ms: float) -> None:
-    camera, lens = shot.frame.camera, shot.lens
+    camera, lens = shot.camera, shot.lens
     blur = max(map(abs, facts["coc_radius_px"]))
     opening = f"aperture radius {lens.aperture_radius_m * 1e3:.4g} mm"
     if lens.f_number is not None:
         opening += f" (f/{lens.f_number:.3g} at {lens.focal_length_mm:.4g} mm)"
-    print(f"{output}  {camera.width}x{camera.height}, {facts['method']}, {facts['layers']} layers")
+    amount = f"{facts['layers']} layers" if facts["layers"] else f"{facts['settings']['views']} views"
+    if facts["settings"].get("supersample", 1) > 1:
+        amount += f", supersampled by {facts['settings']['supersample']}"
+    print(f"{output}  {camera.width}x{camera.height}, {facts['method']}, {amount}")
     print(f"  lens    {opening}, focus {lens.focus_distance_m:.4g} m, largest blur radius {blur:.1f} px")
-    print(f"  device  {facts['device']}")
+    if facts["device"]:
+        print(f"  device  {facts['device']}")
     if shot.capture_device:
         print(f"  capture {shot.capture_device}")
     steps = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in watch.seconds.items())
-    print(f"  times   {steps} (kernels {kernels_ms:.1f} ms)")
+    print(f"  times   {steps}" + (f" (kernels {kernels_ms:.1f} ms)" if facts["device"] else ""))
     for remark in shot.remarks:
         print(f"  note    {remark}")
 
 
 def _versions() -> dict[str, str]:
     versions = {"cldof": __version__, "python": platform.python_version()}
-    for package in ("numpy", "pyopencl", "pocl-binary-distribution", "pyrender", "trimesh", "PyOpenGL"):
+    for package in (
+        "numpy",
+        "pyopencl",
+        "pocl-binary-distribution",
+        "pyrender",
+        "trimesh",
+        "PyOpenGL",
+        "pillow",
+        "OpenEXR",
+    ):
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
@@ -489,7 +786,9 @@ class _Stopwatch:
                 print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
         def progress(done: int, total: int) -> None:
-            state["text"] = f"{name} {done}/{total}"
+            filled = _BAR_WIDTH * done // max(total, 1)
+            bar = f" [{'#' * filled}{'.' * (_BAR_WIDTH - filled)}]" if total >= _BAR_FROM else ""
+            state["text"] = f"{name} {done}/{total}{bar}"
 
         narrator = None
         if self._live and not self._quiet:

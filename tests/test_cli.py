@@ -17,10 +17,14 @@ from PIL import Image
 
 import cldof
 from cldof import Camera, CaptureError, LayeredFrame
-from cldof.capture.scenes import builtin_scenes
+from cldof.capture.accumulate import accumulate
+from cldof.capture.peel import DepthPeeler
+from cldof.capture.scenes import SHOW, TEST, builtin_scenes
 from cldof.cli import main
 from cldof.host.device import DeviceInfo
 from cldof.images import read_metadata
+from cldof.method_options import options_of
+from cldof.methods import METHODS
 from tests.opengl import require_opengl
 
 TRIANGLE = "v -1 -1 0\nv 1 -1 0\nv 0 1 0.4\nf 1 2 3\n"
@@ -165,11 +169,12 @@ def test_slow_steps_are_told_while_they_last(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr("cldof.cli._PATIENCE_S", 0.02)
     with _Stopwatch(quiet=False).step("capture") as progress:
-        progress(2, 4)
-        limit = time.monotonic() + 20
-        while "capture 2/4" not in terminal.getvalue() and time.monotonic() < limit:
-            time.sleep(0.01)
-    assert "capture 2/4" in terminal.getvalue()
+        for done, total, shown in ((2, 4, "capture 2/4 "), (16, 64, f"capture 16/64 [{'#' * 7}{'.' * 23}] ")):
+            progress(done, total)
+            limit = time.monotonic() + 20
+            while shown not in terminal.getvalue() and time.monotonic() < limit:
+                time.sleep(0.01)
+            assert shown in terminal.getvalue()
     assert terminal.getvalue().rstrip().endswith(" s")
 
 
@@ -217,6 +222,105 @@ def test_a_capped_guard_band_is_told(on_device: DeviceInfo, capsys: pytest.Captu
     assert "guard band is capped at 7 px" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", [name for name, scene in builtin_scenes().items() if scene.group == TEST])
+def test_renders_scenes_to_test(name: str, on_device: DeviceInfo) -> None:
+    require_opengl()
+    assert main(["render", name, "-o", "out.png", "--size", "48x36", "--peels", "2", "--quiet"]) == 0
+    with Image.open("out.png") as picture:
+        assert picture.size == (48, 36) and picture.mode == "RGB"
+
+
+def test_method_options(frame_file: str, on_device: DeviceInfo) -> None:
+    lens = ["--aperture-radius", "0.1", "--focus-distance", "3", "--quiet"]
+    short = ["--layers", "5", "--sigma-step", "0.7", "--no-cascade", "--engine", "fir"]
+    long = ["--option", "layers=5", "--option", "sigma-step=0.7", "--option", "cascade=no", "--option", "engine=fir"]
+    for options in (short, long):
+        assert main(["render", frame_file, "-o", "out.npy", "--report", "report.json", *lens, *options]) == 0
+        settings = json.loads(Path("report.json").read_text())["settings"]
+        expected = {"layers": 5, "sigma_step": 0.7, "cascade": False, "engine": "fir", "supersample": 1}
+        assert expected.items() <= settings.items()
+        with cldof.Renderer(device=on_device.index, layers=5, sigma_step=0.7, cascade=False, engine="fir") as renderer:
+            assert np.array_equal(np.load("out.npy"), renderer.render(a_frame(), cldof.Lens(0.1, 3.0)).image)
+
+
+def test_supersampling(on_device: DeviceInfo, capsys: pytest.CaptureFixture[str]) -> None:
+    require_opengl()
+    view = ["--size", "60x48", "--focus-at", "30,12"]
+    save = ["--save-frame", "frame.npz", "--report", "report.json", "--pinhole", "sharp.npy"]
+    assert main(["render", "fence", "-o", "large.npy", *view, *save, "--supersample", "2"]) == 0
+    assert "60x48, layered, 4 layers, supersampled by 2" in capsys.readouterr().out
+    report = json.loads(Path("report.json").read_text())
+    assert report["settings"]["supersample"] == 2
+    assert (report["camera"]["width"], report["camera"]["height"]) == (60, 48)
+    frame = LayeredFrame.load("frame.npz")
+    assert frame.camera.width == 120 and frame.guard_px == report["guard_px"]
+    assert frame.guard_px >= 2 * max(map(abs, report["coc_radius_px"])) - 2
+    sharp = frame.pinhole_image().reshape(48, 2, 60, 2, 4).mean(axis=(1, 3))
+    assert np.load("sharp.npy") == pytest.approx(sharp, abs=1e-6)
+    # The saved frame gives the same image, and pixels to focus on are those of the image.
+    again = ["--supersample", "2", "--aperture-radius", str(report["lens"]["aperture_radius_m"])]
+    assert main(["render", "frame.npz", "-o", "again.npy", "--focus-at", "30,12", *again]) == 0
+    assert read_metadata("again.npy")["lens"]["focus_distance_m"] == pytest.approx(
+        report["lens"]["focus_distance_m"], rel=0.01
+    )
+    assert np.load("again.npy") == pytest.approx(np.load("large.npy"), abs=0.01)
+    assert np.load("again.npy").shape == (48, 60, 4)
+    capsys.readouterr()
+    assert "does not divide" in refused(capsys, "render", "frame.npz", "-o", "x.png", "--supersample", "7")
+
+
+def test_accumulates(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    require_opengl()
+    monkeypatch.setattr("cldof.host.device._devices", list)  # no OpenCL needed
+    extra = ["--aperture", "gaussian", "--no-jitter", "--report", "report.json", "--pinhole", "sharp.npy"]
+    arguments = ["render", "floating", "--method", "accumulate", "--views", "8", "--size", "40x30"]
+    assert main([*arguments, "-o", "out.npy", *extra]) == 0
+    out = capsys.readouterr().out
+    assert "out.npy  40x30, accumulate, 8 views" in out and "noise floor" in out
+    report = json.loads(Path("report.json").read_text())
+    assert report["settings"] == {"views": 8, "jitter": False, "seed": 0}
+    assert report["lens"]["aperture"]["shape"] == "gaussian"
+    assert report["device"] is None and report["capture_device"] and report["layers"] is None
+    assert 15.0 < report["plan"]["noise_floor_db"] < 80.0
+    assert {"scene", "preview", "accumulate", "write"} == set(report["timings"]["steps_s"])
+    scene = builtin_scenes()["floating"].make()
+    camera = scene.camera_for(40, 30)
+    lens = cldof.Lens(scene.aperture_radius_m or 0.0, scene.focus_distance_m or 0.0)
+    with DepthPeeler(40, 30) as peeler:
+        expected = accumulate(peeler, scene, camera, lens, 8, shape="gaussian").image
+        pinhole = peeler.peel(scene, camera, layers=8).pinhole_image()
+    assert np.array_equal(np.load("out.npy"), expected)
+    assert np.load("sharp.npy") == pytest.approx(pinhole, abs=1e-5)
+
+
+def test_accumulates_with_any_aperture() -> None:
+    require_opengl()
+    Image.fromarray(np.pad(np.full((8, 8), 255, np.uint8), 8)).save("hole.png")
+    images = {}
+    for text, shape in (
+        ("disc", {"shape": "disc", "ratio": 2.0}),
+        ("polygon:5", {"shape": "polygon", "blades": 5, "rotation_deg": 0.0, "curvature": 0.0}),
+        ("polygon:7:15:0.5", {"shape": "polygon", "blades": 7, "rotation_deg": 15.0, "curvature": 0.5}),
+        ("image:hole.png", {"shape": "image", "image_size": [24, 24]}),
+    ):
+        more = ["--views", "4", "--size", "24x24", "--aperture", text, "--anamorphic", "2", "--quiet"]
+        assert main(["render", "floating", "-o", "out.npy", "--method", "accumulate", *more]) == 0
+        assert shape.items() <= read_metadata("out.npy")["lens"]["aperture"].items()
+        assert read_metadata("out.npy")["settings"]["jitter"] is True
+        images[text] = np.load("out.npy").tobytes()
+    assert len(set(images.values())) == len(images)
+
+
+def test_files_are_seen_from_where_one_likes(model_file: str, on_device: DeviceInfo) -> None:
+    require_opengl()
+    poses = []
+    for view in ([], ["--azimuth", "-50"], ["--azimuth", "0", "--elevation", "-10"]):
+        assert main(["render", model_file, "-o", "out.npy", "--size", "24x24", "--quiet", *view]) == 0
+        back = np.array(read_metadata("out.npy")["camera"]["pose_camera_to_world"])[:3, 2]
+        poses.append((math.degrees(math.atan2(back[0], back[2])), math.degrees(math.asin(back[1]))))
+    assert poses == [pytest.approx(expected, abs=1e-6) for expected in ((30, 14), (-50, 14), (0, -10))]
+
+
 def pose(x: float, y: float, z: float) -> list[list[float]]:
     return [[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, z], [0, 0, 0, 1]]
 
@@ -225,6 +329,17 @@ def test_lists_scenes(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenes"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in builtin_scenes())
+    assert out.startswith(f"{SHOW}:") and f"\n{TEST}:\n" in out
+
+
+def test_lists_methods_and_their_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["methods"]) == 0
+    out = capsys.readouterr().out
+    for method in METHODS:
+        assert f"\n{method}: " in f"\n{out}"
+        assert all(f"  {option}=" in out for option in options_of(method))
+    assert "accumulate: " in out and "--views" in out
+    assert max(map(len, out.splitlines())) <= 100
 
 
 def test_lists_devices(on_device: DeviceInfo, capsys: pytest.CaptureFixture[str]) -> None:
@@ -383,6 +498,29 @@ def test_unknown_ending(frame_file: str, capsys: pytest.CaptureFixture[str]) -> 
     assert "supported are .npz" in refused(capsys, "render", "row", "-o", "out.png", "--save-frame", "frame.npy")
 
 
+@pytest.mark.parametrize(
+    "options, says",
+    [
+        (["--device", "0", "--peels", "3"], "leave out --device, --peels"),
+        (["--layers", "5", "--option", "x=1", "--save-frame", "f.npz"], "leave out --option, --layers, --save-frame"),
+        (["--supersample", "2"], "leave out --supersample"),
+        (["--views", "0"], "views is 0"),
+        (["--aperture", "star"], "use disc, gaussian, polygon:BLADES"),
+        (["--aperture", "polygon:six"], "use disc, gaussian, polygon:BLADES"),
+        (["--aperture", "polygon:6:1:0:9"], "use disc, gaussian, polygon:BLADES"),
+        (["--aperture", "polygon:2"], "blades is 2"),
+        (["--aperture", "polygon:6:0:7"], "curvature is 7"),
+        (["--aperture", "image:none.png"], "Cannot read the aperture image none.png"),
+        (["--anamorphic", "0"], "ratio is 0"),
+        (["--azimuth", "3"], "floating has a camera of its own; leave out --azimuth"),
+    ],
+)
+def test_bad_options_of_accumulate(options: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    require_opengl()
+    base = ["render", "floating", "-o", "out.png", "--method", "accumulate", "--size", "16x16"]
+    assert says in refused(capsys, *base, *options)
+
+
 def test_a_full_disk(
     frame_file: str, on_device: DeviceInfo, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -405,6 +543,20 @@ def test_a_full_disk(
         (["--focus-at", "99,3"], "outside the image"),
         (["--size", "32x32"], "leave out --size"),
         (["--unlit", "--peels", "3"], "leave out --unlit, --peels"),
+        (["--azimuth", "0"], "leave out --azimuth"),
+        (["--method", "accumulate"], "is a captured frame; --method accumulate draws the scene itself"),
+        (["--views", "8", "--no-jitter"], "--views, --no-jitter: for --method accumulate only, not for 'layered'"),
+        (["--jitter"], "--jitter: for --method accumulate only"),
+        (["--aperture", "disc"], "simulates a gaussian lens and no other; leave out --aperture"),
+        (["--anamorphic", "2"], "leave out --anamorphic"),
+        (["--option", "rays=3"], "no option 'rays'; its options are: layers, "),
+        (["--option", "layers"], "is not NAME=VALUE"),
+        (["--layers", "many"], "'layers' of method 'layered' is 'many'; it must be: int"),
+        (["--layers", "2"], "layers is 2"),
+        (["--layers", "5", "--option", "layers=6"], "given twice"),
+        (["--engine", "steam"], "engine is 'steam'"),
+        (["--supersample", "0"], "supersample is 0"),
+        (["--supersample", "1000"], "supersample is 1000"),
     ],
 )
 def test_bad_options(
