@@ -70,7 +70,7 @@ def simulated_aperture(method: str) -> str | None:
 
 
 def parse_options(method: str, pairs: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """Read ``(name, value)`` pairs of text as a method's options; names may have dashes.
+    """Read ``(name, value)`` pairs of text as a method's options; names may have dashes, tuples are ``1,2``.
 
     Raises
     ------
@@ -101,6 +101,9 @@ def _read(text: str, hint: Any, method: str, option: Option) -> Any:
     kinds = typing.get_args(hint) if typing.get_origin(hint) in (types.UnionType, typing.Union) else (hint,)
     for kind in sorted(kinds, key=_rank):
         try:
+            if typing.get_origin(kind) is tuple:
+                parts = text.strip("()").split(",")
+                return tuple(_READERS[k](v.strip()) for k, v in zip(typing.get_args(kind), parts, strict=True))
             return _READERS[kind](text)
         except (KeyError, ValueError):
             continue
@@ -125,7 +128,7 @@ _READERS: dict[Any, Any] = {type(None): _none, bool: _bool, int: int, float: flo
 
 def _rank(kind: Any) -> int:
     """Of several types, the narrowest that fits is meant."""
-    return list(_READERS).index(kind) if kind in _READERS else len(_READERS)
+    return list(_READERS).index(kind) if kind in _READERS else -1
 
 
 def _documented(doc: str) -> dict[str, tuple[str, str]]:

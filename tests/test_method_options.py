@@ -24,6 +24,8 @@ class Imagined:
     width : float
         In px.
     early : bool
+    ends : (int, int), optional
+        First, last.
     name_of : {"this", "that"}
         Which.
 
@@ -37,6 +39,7 @@ class Imagined:
     steps: int | None = 3
     width: float = 1.5
     early: bool = True
+    ends: tuple[int, int] | None = None
     name_of: str = "this"
     derived: int = dataclasses.field(init=False, default=0)
 
@@ -62,7 +65,7 @@ def test_every_method_documents_every_option(method: str) -> None:
 
 def test_options_of_a_class(imagined: str) -> None:
     options = options_of(imagined)
-    assert list(options) == ["rays", "steps", "width", "early", "name_of"]
+    assert list(options) == ["rays", "steps", "width", "early", "ends", "name_of"]
     assert options["rays"] == ("rays", "int", None, "Both are counts.")
     assert options["steps"].text == "Both are counts." and options["steps"].default == 3
     assert options["name_of"].kind == '{"this", "that"}'
@@ -79,6 +82,9 @@ def test_options_of_a_class(imagined: str) -> None:
         ("width", "1e-3", 0.001),
         ("early", "no", False),
         ("early", "True", True),
+        ("ends", "-3,5", (-3, 5)),
+        ("ends", "(-3, 5)", (-3, 5)),
+        ("ends", "None", None),
         ("name-of", " that ", "that"),
     ],
 )
@@ -90,10 +96,12 @@ def test_reads_values(imagined: str, name: str, text: str, value: Any) -> None:
 @pytest.mark.parametrize(
     "pairs, says",
     [
-        ([("rayz", "8")], "no option 'rayz'; its options are: rays, steps, width, early, name_of"),
+        ([("rayz", "8")], "no option 'rayz'; its options are: rays, steps, width, early, ends, name_of"),
         ([("derived", "8")], "no option 'derived'"),
         ([("rays", "eight")], "'rays' of method 'imagined' is 'eight'; it must be: int"),
         ([("rays", "8.5")], "it must be: int"),
+        ([("ends", "3")], r"it must be: \(int, int\)"),
+        ([("ends", "3,4,5")], r"it must be: \(int, int\)"),
         ([("early", "2")], "it must be: bool"),
         ([("rays", "8"), ("rays", "9")], "given twice"),
     ],
