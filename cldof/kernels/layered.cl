@@ -41,16 +41,19 @@
 
 /* Matting functions of all layers, per layer (up scale, up offset, down scale, down offset): with w the inverse depth,
  * clamp(w * scale + offset, 0, 1) rises over the interval before the layer and falls over the one behind it.
- * Reach is how far, in px, a layer's blur opens a gap to its neighbour. */
+ * Reach is how far, in px, a layer's blur opens a gap to its neighbour; around is the distance at which to look for the
+ * rest of a surface, about one sigma of the layer's blur. */
 typedef struct {
     float4 layer[LAYERED_MAX_LAYERS];
     float reach[LAYERED_MAX_LAYERS];
+    int around[LAYERED_MAX_LAYERS];
 } LayeredMatting;
 
 /* What a layer needs of that: its own functions and those of the layer before it (zeros for the first). */
 typedef struct {
     float4 own, before;
     float reach;
+    int around;
 } LayeredLayer;
 
 typedef struct {
@@ -88,33 +91,75 @@ static inline float16 over(float16 front, float16 back)
 
 static inline LayeredLayer layered_layer(const LayeredMatting *matting, int k)
 {
-    LayeredLayer layer = {matting->layer[k], k > 0 ? matting->layer[k - 1] : (float4)(0.0f), matting->reach[k]};
+    LayeredLayer layer = {matting->layer[k], k > 0 ? matting->layer[k - 1] : (float4)(0.0f), matting->reach[k],
+                          matting->around[k]};
     return layer;
 }
 
-static inline float16 layered_least_step(float16 w, float16 a, float16 b)
+static inline float16 layered_least_step(float16 w, float16 a, float16 b, float silhouette)
 {
     float16 to_a = w > a ? w - a : a - w, to_b = w > b ? w - b : b - w;
-    to_a = a < 0.0f ? (float16)(MAXFLOAT) : to_a;
-    to_b = b < 0.0f ? (float16)(MAXFLOAT) : to_b;
+    to_a = a < 0.0f || to_a > silhouette ? (float16)(MAXFLOAT) : to_a;
+    to_b = b < 0.0f || to_b > silhouette ? (float16)(MAXFLOAT) : to_b;
     to_a = to_a < to_b ? to_a : to_b;
     return to_a < MAXFLOAT ? to_a : (float16)(0.0f);
 }
 
-/* Change of inverse depth from one pixel to the next, for 16 slots: the lesser of both sides, so that a silhouette does
- * not count as a slope, and the greater of both directions. */
-static inline float16 layered_slope(const __global float *inv, float16 w, LayeredSize size, int x, int y)
+/* Change of inverse depth from one pixel to the next, for 16 slots: the lesser of both sides and the greater of both
+ * directions. Steps above `silhouette` are where one surface ends and do not count. */
+static inline float16 layered_slope(const __global float *inv, float16 w, LayeredSize size, int x, int y,
+                                    float silhouette)
 {
     const float16 none = (float16)(EMPTY);
     float16 left = x > 0 ? load_quad(inv - 1) : (float16)(EMPTY, w.s01234567, w.s89ab, w.scd, w.se);
     float16 right = x + 16 < size.pitch ? load_quad(inv + 1) : (float16)(w.s12345678, w.s9abc, w.sde, w.sf, EMPTY);
     float16 above = y > 0 ? load_quad(inv - size.pitch) : none;
     float16 below = y + 1 < size.height ? load_quad(inv + size.pitch) : none;
-    float16 across = layered_least_step(w, left, right), down = layered_least_step(w, above, below);
+    float16 across = layered_least_step(w, left, right, silhouette);
+    float16 down = layered_least_step(w, above, below, silhouette);
     return across > down ? across : down;
 }
 
-/* Weights of 16 slots in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), with two changes.
+/* Slots x .. x+15 of a row; beyond its ends the row repeats its last slot. */
+static inline float16 layered_row(const __global float *row, int x, int width)
+{
+    if (x >= 0 && x + 16 <= width) return load_quad(row + x);
+    float v[16];
+    for (int i = 0; i < 16; i++) v[i] = row[clamp_index(x + i, width - 1)];
+    return (float16)(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14],
+                     v[15]);
+}
+
+/* How many of two opposite slots belong to the surface of the slot w between them, or hide it: those that are not
+ * farther by more than `step`, or lie on a plane through the three. */
+static inline float16 layered_pair(float16 w, float16 a, float16 b, float step)
+{
+    const float16 zero = (float16)(0.0f), one = (float16)(1.0f);
+    float16 a_nearer = a > w ? a - w : zero, b_nearer = b > w ? b - w : zero;
+    return (a >= 0.0f && a >= w - b_nearer - step ? one : zero) + (b >= 0.0f && b >= w - a_nearer - step ? one : zero);
+}
+
+/* Share of the surroundings, one sigma of the blur away, that belong to the surface of each of 16 slots of the first
+ * peel: about what is left of its coverage there when it is blurred. */
+static inline float16 layered_breadth(const __global float *inv_depth, float16 w, LayeredSize size, LayeredLayer layer,
+                                      int x, int y)
+{
+    const int far = layer.around, near = far * 7 / 10 > 1 ? far * 7 / 10 : 1;
+    const float step = 1.0f / layer.before.z;
+    const int last = size.height - 1;
+    const __global float *here = inv_depth + (size_t)y * size.pitch;
+    const __global float *up = inv_depth + (size_t)clamp_index(y - near, last) * size.pitch;
+    const __global float *down = inv_depth + (size_t)clamp_index(y + near, last) * size.pitch;
+    const __global float *top = inv_depth + (size_t)clamp_index(y - far, last) * size.pitch;
+    const __global float *bottom = inv_depth + (size_t)clamp_index(y + far, last) * size.pitch;
+    float16 found = layered_pair(w, layered_row(here, x - far, size.width), layered_row(here, x + far, size.width), step);
+    found += layered_pair(w, load_quad(top + x), load_quad(bottom + x), step);
+    found += layered_pair(w, layered_row(up, x - near, size.width), layered_row(down, x + near, size.width), step);
+    found += layered_pair(w, layered_row(up, x + near, size.width), layered_row(down, x - near, size.width), step);
+    return found * 0.125f;
+}
+
+/* Weights of 16 slots in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), with three changes.
  *
  * Hidden slots may fall as gently as visible ones where the slot before them already stands in this layer or in front of
  * it (has not begun to fall): there nothing shows through that a nearer surface hides.
@@ -122,9 +167,14 @@ static inline float16 layered_slope(const __global float *inv, float16 w, Layere
  * Slots of the interval before the layer are there to close the seam where a surface goes on into the layer and the
  * blurred end of the layer before it lets through what is behind. The seam is as wide as the blur, so the rise is cut
  * to that width: a surface that does not slope into the layer brings nothing, where the paper's full rise would widen
- * its silhouette. */
-static inline float16 layered_weight(const __global float *inv, float16 w, float16 before, LayeredLayer layer, int peel,
-                                     LayeredSize size, int x, int y)
+ * its silhouette.
+ *
+ * A visible slot in the layer's own interval is also in the layer before, with weight 1 - t, t being how far it is into
+ * the interval. Inside a broad surface it takes its full weight behind that, or the background would show through; of a
+ * thin one, whose blurred coverage is small, both would add up to more than there is. With b the breadth of the surface
+ * t / (1 - (1 - t) b) is right for both. */
+static inline float16 layered_weight(const __global float *inv_depth, const __global float *inv, float16 w,
+                                     float16 before, LayeredLayer layer, int peel, LayeredSize size, int x, int y)
 {
     const float16 zero = (float16)(0.0f), one = (float16)(1.0f);
     float16 rising = w * layer.own.x + layer.own.y;
@@ -137,10 +187,17 @@ static inline float16 layered_weight(const __global float *inv, float16 w, float
     if (peel > 0) down = before * layer.own.z + layer.own.w >= 1.0f ? down : at_once;
     float16 between = rising > 0.0f && rising < 1.0f ? one : zero;
     if (sum16(between) > 0.0f) {
-        float16 part = layered_slope(inv, w, size, x, y) * (-layer.own.x * layer.reach);
+        float16 part = layered_slope(inv, w, size, x, y, -2.0f / layer.own.x) * (-layer.own.x * layer.reach);
         part = part > 1.0f ? one : part;
         part = part < 1e-3f ? (float16)(1e-3f) : part;
         up = clamp01((rising - 1.0f) / part + 1.0f);
+    }
+    float16 rest = clamp01(w * layer.before.z + layer.before.w); /* 1 - t */
+    float16 shared = rising >= 1.0f && falling >= 1.0f && w >= 0.0f ? rest : zero;
+    if (peel == 0 && sum16(shared) > 0.0f) {
+        float16 others = 1.0f - rest * layered_breadth(inv_depth, w, size, layer, x, y);
+        up = shared > 0.0f ? (1.0f - rest) / (others > 1e-3f ? others : (float16)(1e-3f)) : up;
+        up = shared > 0.0f && others <= 1e-3f ? one : up;
     }
 #endif
     return w < 0.0f ? zero : up * down;
@@ -192,7 +249,7 @@ static inline void layered_block(float16 quad[4], const __global float *color, c
         const __global float *inv = inv_depth + row * size.pitch + x;
         float16 w = load_quad(inv);
         float16 before = m > 0 ? load_quad(inv - (size_t)size.height * size.pitch) : w;
-        float16 weight = layered_weight(inv, w, before, layer, m, size, x, y);
+        float16 weight = layered_weight(inv_depth, inv, w, before, layer, m, size, x, y);
         if (sum16(weight) <= 0.0f) continue;
         const __global float *rgba = color + (row * size.width + x) * 4;
         float4 weights[4] = {weight.s0123, weight.s4567, weight.s89ab, weight.scdef};

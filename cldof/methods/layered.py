@@ -71,7 +71,13 @@ _RESOLVE = np.dtype(
         for name in ("layer", "front", "back", "radius_front", "taps_front", "radius_back", "taps_back", "guard")
     ]
 )
-_MATTING = np.dtype([("layer", np.float32, (MAX_LAYERS, 4)), ("reach", np.float32, (MAX_LAYERS,))])
+_MATTING = np.dtype(
+    [
+        ("layer", np.float32, (MAX_LAYERS, 4)),
+        ("reach", np.float32, (MAX_LAYERS,)),
+        ("around", np.int32, (MAX_LAYERS,)),
+    ]
+)
 
 
 class LayerStack(NamedTuple):
@@ -165,7 +171,10 @@ class Layered:
         params = np.zeros((), _MATTING)
         params["layer"][: stack.total] = matting_functions(coc, c1, c0, self.matting)
         sigma = GAUSSIAN_SIGMA * np.abs(coc)
-        params["reach"][1 : stack.total] = _SEAM_REACH * np.maximum(sigma[1:], sigma[:-1])
+        # Neighbouring layers blur by different amounts: their seam and a surface's breadth go by the greater.
+        sigma[1:] = np.maximum(sigma[1:], sigma[:-1])
+        params["reach"][: stack.total] = _SEAM_REACH * sigma
+        params["around"][: stack.total] = np.maximum(1, np.rint(sigma))
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},

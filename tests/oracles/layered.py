@@ -31,19 +31,38 @@ class Anchors:
         return coc[k]
 
 
-def slope(coc: np.ndarray) -> np.ndarray:
-    """Change of the CoC from pixel to pixel: the lesser of two sides, the greater of two directions; (M, H, W)."""
+def slope(coc: np.ndarray, silhouette: float) -> np.ndarray:
+    """Change of the CoC from pixel to pixel, (H, W): the lesser of two sides, the greater of two directions.
+
+    Steps above `silhouette` do not count.
+    """
     steps = []
-    for axis in (1, 2):
+    for axis in (0, 1):
         step = np.abs(np.diff(coc, axis=axis))
+        step[~(step <= silhouette)] = np.nan
         ahead, behind = np.full_like(coc, np.nan), np.full_like(coc, np.nan)
-        at = [slice(None)] * 3
+        at = [slice(None)] * 2
         at[axis] = slice(None, -1)
         ahead[tuple(at)] = step
         at[axis] = slice(1, None)
         behind[tuple(at)] = step
         steps.append(np.nan_to_num(np.fmin(ahead, behind)))
     return np.maximum(*steps)
+
+
+def breadth(coc: np.ndarray, radius: int, step: float) -> np.ndarray:
+    """Share of eight pixels around each that belong to its surface or hide it, (H, W)."""
+    height, width = coc.shape
+    y, x = np.mgrid[:height, :width]
+    near = max(1, radius * 7 // 10)
+    found = np.zeros(coc.shape)
+    for dx, dy in ((radius, 0), (0, radius), (near, near), (-near, near)):
+        a = coc[np.clip(y - dy, 0, height - 1), np.clip(x - dx, 0, width - 1)]
+        b = coc[np.clip(y + dy, 0, height - 1), np.clip(x + dx, 0, width - 1)]
+        with np.errstate(invalid="ignore"):
+            found += a <= coc + np.fmax(coc - b, 0) + step
+            found += b <= coc + np.fmax(coc - a, 0) + step
+    return found / 8
 
 
 def weights(coc: np.ndarray, alpha: np.ndarray, layers: np.ndarray, paper: bool) -> np.ndarray:
@@ -66,11 +85,10 @@ def weights(coc: np.ndarray, alpha: np.ndarray, layers: np.ndarray, paper: bool)
         result[0] = ~np.isnan(coc)
         return result
     z = Anchors(layers, midpoint=paper)
-    steps = slope(coc)
     sigma = np.abs(layers) / 2.0
     for k in range(count):
         rise_width, fall_width = z[k - 1] - z[k - 2], z[k + 1] - z[k]
-        seam = 2.0 * max(sigma[k], sigma[k - 1]) if k else 0.0
+        widest = max(sigma[k], sigma[k - 1]) if k else sigma[k]
         for m in range(len(coc)):
             c = coc[m]
             before = coc[m - 1] if m else np.full_like(c, -np.inf)
@@ -82,7 +100,7 @@ def weights(coc: np.ndarray, alpha: np.ndarray, layers: np.ndarray, paper: bool)
                 if m:
                     fall = (falling >= 1).astype(float)
             else:
-                part = np.clip(steps[m] / rise_width * seam, 1e-3, 1.0)
+                part = np.clip(slope(c, 2 * rise_width) / rise_width * 2.0 * widest, 1e-3, 1.0)
                 rise = np.where(rising >= 1, 1.0, np.clip(1.0 + (rising - 1.0) / part, 0, 1))
                 may_fall = np.full(c.shape, k == count - 1) | (before <= z[k])
                 fall = np.where(may_fall, fall, (falling >= 1).astype(float))
@@ -91,6 +109,11 @@ def weights(coc: np.ndarray, alpha: np.ndarray, layers: np.ndarray, paper: bool)
                 into = np.ones_like(c)  # how far the slot is into the layer's own interval
                 if k > 0:
                     into = np.where(before <= z[k - 1], np.clip((c - z[k - 1]) / (z[k] - z[k - 1]), -np.inf, 1), 1.0)
+                if k > 0 and m == 0:
+                    around = max(1, round(widest))
+                    others = 1 - (1 - into) * breadth(c, around, z[k] - z[k - 1])
+                    is_own = (rising >= 1) & (falling >= 1) & (into < 1)
+                    weight = np.where(is_own, np.where(others > 1e-3, into / np.maximum(others, 1e-3), 1.0), weight)
                 with np.errstate(divide="ignore", invalid="ignore"):
                     shared = np.where(falling < 1, weight, into / np.maximum(1 - (1 - into) * alpha[m], 1e-3))
                 weight = np.where(alpha[m] < 0.998, np.where(rising >= 1, shared, 0.0), weight)
