@@ -27,6 +27,16 @@ TOLERANCES = {
     "layered_finish": Tolerance(1e-6, 1e-6),
     # a whole frame; a misplaced slot spreads over the blur that follows
     "layered": Tolerance(3e-5, outliers=5e-3),
+    "pyramid_flatten": Tolerance(2e-7, 1e-6),
+    "pyramid_slope": Tolerance(2e-7),
+    # means of 2x2 down to one pixel, and B-splines back
+    "pyramid_fill": Tolerance(1e-6),
+    # front ramps as narrow as a thousandth of an interval, in float32; published steps a thousandth of that
+    "pyramid_matte": Tolerance(2e-4, outliers=1e-3),
+    "pyramid_blur": Tolerance(1e-4, outliers=1e-3),
+    "pyramid": Tolerance(1e-4, outliers=2e-3),
+    # float32 may round a sample to the pixel beside it
+    "gather": Tolerance(1e-5, 1e-5, outliers=2e-2),
 }
 
 

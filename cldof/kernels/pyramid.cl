@@ -7,12 +7,12 @@
  * before s are taken away.
  *
  * A sub-image reaches `margin` pixels beyond the frame on each side; what is out there is unknown and gets filled like
- * any hole. It is blurred by `steps` reductions and as many expansions. Its pyramids start at level 1: level 0, as large
- * as the sub-image, is computed where it is needed and never stored. All levels of all sub-images lie in one buffer,
- * float[][4] for colour and float[] for inverse depth, described by a table int4[sub-images][PYRAMID_LEVELS]:
+ * any hole. It is blurred by `steps` reductions and as many expansions. Its pyramids start at level 1: level 0, as
+ * large as the sub-image, is computed where it is needed and never stored. All levels of all sub-images lie in one
+ * buffer, float[][4] for colour and float[] for inverse depth, described by a table int4[sub-images][PYRAMID_LEVELS]:
  *   entry 0   (margin, steps, width, height of level 0), in px; margin a multiple of 16 and of 2^steps
- *   entry k   (offset of the first pixel, width, height, pitch), in px; level k is half as large as level k - 1, rounded
- *             up; the first `steps` halvings are even; the pitch is a multiple of 16
+ *   entry k   (offset of the first pixel, width, height, pitch), in px; level k is half as large as level k - 1,
+ *             rounded up; the first `steps` halvings are even; the pitch is a multiple of 16
  *
  * Kernels over sub-images have the range (items per row, sub-images, rows): an item takes every get_global_size(0)-th
  * block of its row. Rows are numbered so that the same one shows the same part of the frame in all sub-images, which
@@ -36,8 +36,8 @@
 #ifndef PYRAMID_VOID
 #define PYRAMID_VOID 0
 #endif
-/* What the alpha channel of a flattened image holds. 0: coverage. 1: coverage, and red is alpha, for the second run over
- * a frame that is not opaque; it completes the image of the first. 2: the true alpha. */
+/* What the alpha channel of a flattened image holds. 0: coverage. 1: coverage, and red is alpha, for the second run
+ * over a frame that is not opaque; it completes the image of the first. 2: the true alpha. */
 #ifndef PYRAMID_ALPHA
 #define PYRAMID_ALPHA 0
 #endif
@@ -54,8 +54,8 @@ typedef struct {
 } PyramidSize;
 
 /* Matting functions, per sub-image (up scale, up offset, down scale, down offset): with t the inverse depth, or the
- * depth if PYRAMID_PAPER, clamp(t * scale + offset, 0, 1) is the front and the back ramp. `seam`: per unit of slope (1/m
- * per px), the part of the front ramp that a surface needs to close the seam to the sub-image before. */
+ * depth if PYRAMID_PAPER, clamp(t * scale + offset, 0, 1) is the front and the back ramp. `seam`: per unit of slope
+ * (1/m per px), the part of the front ramp that a surface needs to close the seam to the sub-image before. */
 typedef struct {
     float4 ramp[PYRAMID_COUNT];
     float seam[PYRAMID_COUNT];
@@ -96,52 +96,54 @@ static inline float4 part(float16 v, int q)
  *         inv_depth  float[peels][height][pitch]  1/m
  * writes  flat       float[sources][height][pitch][4]  0 in holes and past the row
  *         flat_inv   float[sources][height][pitch]     1/m, of the peel with which half of the pixel is covered
- * range   2-D, one item per quad and row of a source: (pitch / 4, sources * height), any local size */
+ * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th quad */
 __kernel void pyramid_flatten(__global float *restrict flat, __global float *restrict flat_inv,
                               const __global float *restrict color, const __global float *restrict inv_depth,
                               PyramidSize size)
 {
-    const int x = 4 * (int)get_global_id(0), row = get_global_id(1);
+    const int row = get_global_id(1);
     const int source = row / size.height, y = row % size.height;
-    if (x >= size.pitch || source >= size.sources) return;
-    const int n = size.width - x;
-    float16 image = (float16)(0.0f);
-    float4 depth = (float4)(EMPTY), nearest = (float4)(EMPTY);
-    for (int m = source; m < size.peels && n > 0; m++) {
-        const size_t at = (size_t)m * size.height + y;
-        const __global float *rgba = color + (at * size.width + x) * 4;
-        float4 w = load_pixel(inv_depth + at * size.pitch + x);
-        float16 c = n >= 4 ? load_quad(rgba) : load_quad_part(rgba, n);
-        int4 there = (w >= 0.0f) & (c.s37bf > 0.0f);
-        image += (1.0f - image.s33337777bbbbffff) * c;
+    for (int x = 4 * get_global_id(0); x < size.pitch; x += 4 * get_global_size(0)) {
+        const int n = size.width - x;
+        float16 image = (float16)(0.0f);
+        float4 depth = (float4)(EMPTY), nearest = (float4)(EMPTY);
+        for (int m = source; m < size.peels && n > 0; m++) {
+            const size_t at = (size_t)m * size.height + y;
+            const __global float *rgba = color + (at * size.width + x) * 4;
+            float4 w = load_pixel(inv_depth + at * size.pitch + x);
+            if (w.x < 0.0f && w.y < 0.0f && w.z < 0.0f && w.w < 0.0f) continue;
+            float16 c = n >= 4 ? load_quad(rgba) : load_quad_part(rgba, n);
+            int4 there = (w >= 0.0f) & (c.s37bf > 0.0f);
+            image += (1.0f - image.s33337777bbbbffff) * c;
+            float4 alpha = image.s37bf;
+            nearest = ((nearest < 0.0f) & there) ? w : nearest;
+            depth = ((depth < 0.0f) & there & (alpha >= 0.5f)) ? w : depth;
+            if (alpha.x >= 1.0f && alpha.y >= 1.0f && alpha.z >= 1.0f && alpha.w >= 1.0f) break;
+        }
+        const int4 inside = (int4)(0, 1, 2, 3) < n;
         float4 alpha = image.s37bf;
-        nearest = (nearest < 0.0f) & there ? w : nearest;
-        depth = (depth < 0.0f) & there & (alpha >= 0.5f) ? w : depth;
-        if (alpha.x >= 1.0f && alpha.y >= 1.0f && alpha.z >= 1.0f && alpha.w >= 1.0f) break;
-    }
-    const int4 inside = (int4)(0, 1, 2, 3) < n;
-    float4 alpha = image.s37bf;
 #if PYRAMID_VOID
-    float4 known = (float4)(1.0f);
-    depth = depth < 0.0f ? nearest : depth;
-    depth = depth < 0.0f ? (float4)(0.0f) : depth;
-    depth = inside ? depth : (float4)(EMPTY);
+        float4 known = (float4)(1.0f);
+        depth = depth < 0.0f ? nearest : depth;
+        depth = depth < 0.0f ? (float4)(0.0f) : depth;
+        depth = inside ? depth : (float4)(EMPTY);
 #else
-    int4 is_known = (alpha >= 0.5f) & inside;
-    float4 known = is_known ? (float4)(1.0f) : (float4)(0.0f);
-    image *= spread(is_known ? 1.0f / alpha : (float4)(0.0f));
-    depth = is_known ? depth : (float4)(EMPTY);
+        int4 is_known = (alpha >= 0.5f) & inside;
+        float4 known = is_known ? (float4)(1.0f) : (float4)(0.0f);
+        image *= spread(is_known ? 1.0f / alpha : (float4)(0.0f));
+        depth = is_known ? depth : (float4)(EMPTY);
 #endif
 #if PYRAMID_ALPHA == 0
-    image.s37bf = known;
+        image.s37bf = known;
 #elif PYRAMID_ALPHA == 1
-    const float16 red = (float16)(1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0);
-    image = image.s33337777bbbbffff * red;
-    image.s37bf = known;
+        const float16 red = (float16)(1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0);
+        image = image.s33337777bbbbffff * red;
+        image.s37bf = known;
 #endif
-    const size_t to = (size_t)row * size.pitch + x;
-    store_quad(flat + to * 4, image * spread(inside ? (float4)(1.0f) : (float4)(0.0f)));
-    store_four(flat_inv + to, depth);
+        const size_t to = (size_t)row * size.pitch + x;
+        store_quad(flat + to * 4, image * spread(inside ? (float4)(1.0f) : (float4)(0.0f)));
+        store_four(flat_inv + to, depth);
+    }
 }
 
 static inline float16 least_step(float16 w, float16 a, float16 b)
@@ -153,25 +155,25 @@ static inline float16 least_step(float16 w, float16 a, float16 b)
     return to_a < MAXFLOAT ? to_a : (float16)(0.0f);
 }
 
-/* pyramid_slope: change of inverse depth from one pixel to the next, the lesser of both sides, so that a silhouette does
- * not count as a slope, and the greater of both directions.
+/* pyramid_slope: change of inverse depth from one pixel to the next, the lesser of both sides, so that a silhouette
+ * does not count as a slope, and the greater of both directions.
  * reads   flat_inv  float[sources][height][pitch]  1/m
  * writes  slope     float[sources][height][pitch]  1/m per px; 0 where no neighbour is known; anything in holes
- * range   2-D, one item per 16 pixels and row of a source: (pitch / 16, sources * height), any local size */
+ * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_slope(__global float *restrict slope, const __global float *restrict flat_inv, PyramidSize size)
 {
-    const int x = 16 * (int)get_global_id(0), row = get_global_id(1);
-    const int y = row % size.height;
-    if (x >= size.pitch || row >= size.sources * size.height) return;
-    const __global float *inv = flat_inv + (size_t)row * size.pitch + x;
-    const float16 none = (float16)(EMPTY);
-    float16 w = load_quad(inv);
-    float16 left = x > 0 ? load_quad(inv - 1) : (float16)(EMPTY, w.s01234567, w.s89ab, w.scd, w.se);
-    float16 right = x + 16 < size.pitch ? load_quad(inv + 1) : (float16)(w.s12345678, w.s9abc, w.sde, w.sf, EMPTY);
-    float16 above = y > 0 ? load_quad(inv - size.pitch) : none;
-    float16 below = y + 1 < size.height ? load_quad(inv + size.pitch) : none;
-    float16 across = least_step(w, left, right), down = least_step(w, above, below);
-    store_quad(slope + (size_t)row * size.pitch + x, across > down ? across : down);
+    const int row = get_global_id(1), y = row % size.height;
+    for (int x = 16 * get_global_id(0); x < size.pitch; x += 16 * get_global_size(0)) {
+        const __global float *inv = flat_inv + (size_t)row * size.pitch + x;
+        const float16 none = (float16)(EMPTY);
+        float16 w = load_quad(inv);
+        float16 left = x > 0 ? load_quad(inv - 1) : (float16)(EMPTY, w.s01234567, w.s89ab, w.scd, w.se);
+        float16 right = x + 16 < size.pitch ? load_quad(inv + 1) : (float16)(w.s12345678, w.s9abc, w.sde, w.sf, EMPTY);
+        float16 above = y > 0 ? load_quad(inv - size.pitch) : none;
+        float16 below = y + 1 < size.height ? load_quad(inv + size.pitch) : none;
+        float16 across = least_step(w, left, right), down = least_step(w, above, below);
+        store_quad(slope + (size_t)row * size.pitch + x, across > down ? across : down);
+    }
 }
 
 /* --- matting (section 3.3) --- */
@@ -190,10 +192,13 @@ static inline float16 matting_rise(float16 w, float16 slope, float4 ramp, float 
 {
     float16 rising = matting_axis(w) * ramp.x + ramp.y;
 #if !PYRAMID_PAPER
-    float16 needed = slope * seam;
-    needed = needed > 1.0f ? (float16)(1.0f) : needed;
-    needed = needed < 1e-3f ? (float16)(1e-3f) : needed;
-    rising = (rising - 1.0f) / needed + 1.0f;
+    float16 between = rising > 0.0f && rising < 1.0f ? (float16)(1.0f) : (float16)(0.0f);
+    if (sum16(between) > 0.0f) {
+        float16 needed = slope * seam;
+        needed = needed > 1.0f ? (float16)(1.0f) : needed;
+        needed = needed < 1e-3f ? (float16)(1e-3f) : needed;
+        rising = (rising - 1.0f) / needed + 1.0f;
+    }
 #endif
     return w < 0.0f ? (float16)(0.0f) : clamp01(rising);
 }
@@ -203,8 +208,10 @@ static inline float16 matting_fall(float16 w, float4 ramp) { return clamp01(matt
 /* --- culling (section 3.1) --- */
 
 /* The first source of 16 frame pixels that a sub-image does not cull.
- * Returns its front ramp, 0 where all sources are culled; there `from` is -1 and `inverse` EMPTY. */
-static inline float16 cull(float16 *from, float16 *inverse, const __global float *flat_inv,
+ * Returns its front ramp, 0 where all sources are culled; there `from` is -1 and `inverse` EMPTY. `only` is the source
+ * of all 16, -1 if all are culled, MIXED if they differ. */
+#define MIXED (-2)
+static inline float16 cull(float16 *from, int *only, float16 *inverse, const __global float *flat_inv,
                            const __global float *slope, PyramidSize size, float4 ramp, float seam, int x, int y)
 {
     float16 rise = (float16)(0.0f), w = (float16)(EMPTY), source = (float16)(-1.0f);
@@ -224,15 +231,19 @@ static inline float16 cull(float16 *from, float16 *inverse, const __global float
             if (s + 1 < size.sources && count_holes(w) == 0.0f) break;
         }
     }
+    const float holes = count_holes(w), front = sum16(source == 0.0f ? (float16)(1.0f) : (float16)(0.0f));
+    *only = front == 16.0f ? 0 : holes == 16.0f ? -1 : MIXED;
     *from = source;
     *inverse = w;
     return rise;
 }
 
 /* Colours of a quad from the sources that `cull` chose; 0 in holes. */
-static inline float16 source_quad(const __global float *flat, PyramidSize size, float4 from, int x, int y)
+static inline float16 source_quad(const __global float *flat, PyramidSize size, float4 from, int only, int x, int y)
 {
     float16 c = (float16)(0.0f);
+    if (only == -1) return c;
+    if (only == 0) return load_quad(flat + ((size_t)y * size.pitch + x) * 4);
     for (int s = 0; s < size.sources; s++) {
         float4 is = from == (float)s ? (float4)(1.0f) : (float4)(0.0f);
         if (sum4(is) == 0.0f) continue;
@@ -282,16 +293,24 @@ __kernel void pyramid_cull(__global float *restrict fill, __global float *restri
         const int x = 16 * b - sub.x;
         const size_t to = (size_t)level.x + (size_t)row * level.w + 8 * b;
         float16 from[2], w[2];
-        cull(&from[0], &w[0], flat_inv, slope, size, ramp, seam, x, y);
-        cull(&from[1], &w[1], flat_inv, slope, size, ramp, seam, x, y + 1);
+        int only[2];
+        cull(&from[0], &only[0], &w[0], flat_inv, slope, size, ramp, seam, x, y);
+        cull(&from[1], &only[1], &w[1], flat_inv, slope, size, ramp, seam, x, y + 1);
+        if (only[0] == -1 && only[1] == -1) {
+            store_quad(fill + to * 4, (float16)(0.0f));
+            store_quad(fill + to * 4 + 16, (float16)(0.0f));
+            store_four(fill_inv + to, (float4)(EMPTY));
+            store_four(fill_inv + to + 4, (float4)(EMPTY));
+            continue;
+        }
 #pragma unroll
         for (int h = 0; h < 2; h++) { /* halves of the block */
             float16 c[2][2];
 #pragma unroll
             for (int r = 0; r < 2; r++) {
                 float8 f = h ? from[r].hi : from[r].lo;
-                c[r][0] = source_quad(flat, size, f.lo, x + 8 * h, y + r);
-                c[r][1] = source_quad(flat, size, f.hi, x + 8 * h + 4, y + r);
+                c[r][0] = source_quad(flat, size, f.lo, only[r], x + 8 * h, y + r);
+                c[r][1] = source_quad(flat, size, f.hi, only[r], x + 8 * h + 4, y + r);
             }
             pull_quad(fill + (to + 4 * h) * 4, fill_inv + to + 4 * h, c[0][0], c[0][1], h ? w[0].hi : w[0].lo, c[1][0],
                       c[1][1], h ? w[1].hi : w[1].lo);
@@ -346,9 +365,9 @@ static inline Between between(int4 level, int fine_row)
 static inline float16 load_quad_edge(const __global float *row, int x, int width)
 {
     if (x >= 0 && x + 4 <= width) return load_quad(row + x * 4);
-    return (float16)(load_pixel(row + clamp_index(x, width - 1) * 4), load_pixel(row + clamp_index(x + 1, width - 1) * 4),
-                     load_pixel(row + clamp_index(x + 2, width - 1) * 4),
-                     load_pixel(row + clamp_index(x + 3, width - 1) * 4));
+    const int last = width - 1;
+    return (float16)(load_pixel(row + clamp_index(x, last) * 4), load_pixel(row + clamp_index(x + 1, last) * 4),
+                     load_pixel(row + clamp_index(x + 2, last) * 4), load_pixel(row + clamp_index(x + 3, last) * 4));
 }
 
 static inline float8 load_eight_edge(const __global float *row, int x, int width)
@@ -421,11 +440,12 @@ static inline int matted_block(float16 quad[4], const __global float *flat, cons
                                float seam, int x, int y)
 {
     float16 from, w;
-    float16 weight = cull(&from, &w, flat_inv, slope, size, ramp, seam, x, y) * matting_fall(w, ramp);
+    int only;
+    float16 weight = cull(&from, &only, &w, flat_inv, slope, size, ramp, seam, x, y) * matting_fall(w, ramp);
     float16 filled = (float16)(0.0f); /* weight of holes */
     float holes = 0.0f;
     const Between rows = between(level, y + sub.x);
-    if (count_holes(w) > 0.0f) {
+    if (only != 0) {
         float16 v = expand_depth(fill_inv, rows, (x + sub.x) / 2);
         filled = matting_rise(v, (float16)(0.0f), ramp, seam) * matting_fall(v, ramp);
         filled = w < 0.0f ? filled : (float16)(0.0f);
@@ -438,7 +458,7 @@ static inline int matted_block(float16 quad[4], const __global float *flat, cons
     if (pixels > 0.0f) {
 #pragma unroll
         for (int q = 0; q < 4; q++)
-            quad[q] = source_quad(flat, size, part(from, q), x + 4 * q, y) * spread(part(weight, q));
+            quad[q] = source_quad(flat, size, part(from, q), only, x + 4 * q, y) * spread(part(weight, q));
     }
     if (holes > 0.0f) {
 #pragma unroll
@@ -611,38 +631,38 @@ static inline void store_finished(__global float *out, float16 v, PyramidSize si
  *         flat, flat_inv, slope, fill, fill_inv  for the one in focus, which is not blurred
  *         table  int4[sub-images][PYRAMID_LEVELS]
  * writes  out  float[height - 2*guard][width - 2*guard][4]
- * range   2-D, one item per 16 pixels and row of the frame: (pitch / 16, height), any local size */
+ * range   2-D: (items per row, height - 2*guard), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_blend(__global float *restrict out, const __global float *restrict blur,
                             const __global float *restrict flat, const __global float *restrict flat_inv,
                             const __global float *restrict slope, const __global float *restrict fill,
                             const __global float *restrict fill_inv, const __global int4 *restrict table,
                             PyramidSize size, PyramidMatting matting, int count)
 {
-    const int x = 16 * (int)get_global_id(0), y = get_global_id(1);
-    if (x >= size.width || y >= size.height) return;
-    if (y < size.guard || y >= size.height - size.guard) return;
-    float16 sum[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
-    for (int i = 0; i < count; i++) {
-        const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
-        float16 quad[4];
-        if (sub.y == 0) {
-            if (!matted_block(quad, flat, flat_inv, slope, fill, fill_inv, sub, level, size, matting.ramp[i],
-                              matting.seam[i], x, y)) continue;
-        } else {
-            const Between rows = between(level, y + sub.x);
-            expand_quad(quad, blur, rows, (x + sub.x) / 2);
-            expand_quad(quad + 2, blur, rows, (x + sub.x) / 2 + 4);
-        }
-        int covered = 1;
+    const int y = size.guard + (int)get_global_id(1);
+    for (int x = size.guard / 16 * 16 + 16 * (int)get_global_id(0); x < size.width - size.guard;
+         x += 16 * (int)get_global_size(0)) {
+        float16 sum[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+        for (int i = 0; i < count; i++) {
+            const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
+            float16 quad[4];
+            if (sub.y == 0) {
+                if (!matted_block(quad, flat, flat_inv, slope, fill, fill_inv, sub, level, size, matting.ramp[i],
+                                  matting.seam[i], x, y)) continue;
+            } else {
+                const Between rows = between(level, y + sub.x);
+                expand_quad(quad, blur, rows, (x + sub.x) / 2);
+                expand_quad(quad + 2, blur, rows, (x + sub.x) / 2 + 4);
+            }
+            int covered = 1;
 #pragma unroll
-        for (int q = 0; q < 4; q++) {
-            sum[q] += (1.0f - sum[q].s33337777bbbbffff) * quad[q];
-            covered &= sum[q].s3 >= 1.0f && sum[q].s7 >= 1.0f && sum[q].sb >= 1.0f &&
-                       sum[q].sf >= 1.0f;
+            for (int q = 0; q < 4; q++) {
+                sum[q] += (1.0f - sum[q].s33337777bbbbffff) * quad[q];
+                covered &= sum[q].s3 >= 1.0f && sum[q].s7 >= 1.0f && sum[q].sb >= 1.0f && sum[q].sf >= 1.0f;
+            }
+            if (covered) break;
         }
-        if (covered) break;
+#pragma unroll
+        for (int q = 0; q < 4; q++)
+            if (x + 4 * q < size.width) store_finished(out, sum[q], size, x + 4 * q, y);
     }
-#pragma unroll
-    for (int q = 0; q < 4; q++)
-        if (x + 4 * q < size.width) store_finished(out, sum[q], size, x + 4 * q, y);
 }

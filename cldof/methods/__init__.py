@@ -6,6 +6,7 @@ from typing import Any
 
 from ..errors import InputError
 from .base import FrameShape, Method, Plan
+from .gather import Gather
 from .layered import Layered
 from .pyramid import Pyramid
 
@@ -13,6 +14,7 @@ __all__ = ["METHODS", "FrameShape", "Method", "Plan", "make_method"]
 
 # A new method is one line here.
 METHODS: dict[str, type[Any]] = {
+    "gather": Gather,
     "layered": Layered,
     "pyramid": Pyramid,
 }

@@ -6,13 +6,14 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 # Inverse depth where there is nothing, or a hole.
 EMPTY = -1.0
 
 
 class Stack(NamedTuple):
-    """RGBZ images one behind the other: colour (S, H, W, 4) with alpha 1 or 0, inverse depth and its slope (S, H, W)."""
+    """RGBZ images one behind the other: colour (S, H, W, 4), alpha 1 or 0; inverse depth and slope (S, H, W)."""
 
     color: np.ndarray
     inverse: np.ndarray
@@ -65,9 +66,7 @@ def slope(inverse: np.ndarray) -> np.ndarray:
         ends = [(0, 0)] * w.ndim
         before, after = list(ends), list(ends)
         before[axis], after[axis] = (1, 0), (0, 1)
-        sides = np.fmin(
-            np.pad(step, before, constant_values=np.nan), np.pad(step, after, constant_values=np.nan)
-        )
+        sides = np.fmin(np.pad(step, before, constant_values=np.nan), np.pad(step, after, constant_values=np.nan))
         result = np.maximum(result, np.nan_to_num(sides))
     return result
 
@@ -138,7 +137,7 @@ def blur(image: np.ndarray, steps: int) -> np.ndarray:
 
 
 class Matting(NamedTuple):
-    """Which part of a pixel a sub-image takes: rise(inverse, slope) times fall(inverse). Where rise is 0 it is culled."""
+    """What a sub-image takes of a pixel: rise(inverse, slope) times fall(inverse). Where rise is 0 it is culled."""
 
     rise: Callable[[np.ndarray, np.ndarray], np.ndarray]
     fall: Callable[[np.ndarray], np.ndarray]
@@ -198,6 +197,64 @@ def seamless_matting(
         return np.clip((radius(i + 1) - blur_of(inverse)) / (radius(i + 1) - radius(i)), 0.0, 1.0)
 
     return Matting(rise, fall)
+
+
+# Sigma of the Gaussian that fits `blur` best, by steps; `fitted_sigma` measures it.
+FITTED = (0.0, 1.537, 3.367, 6.837, 13.724, *(0.8587 * 2.0**n for n in range(5, 16)))
+
+
+def radius(i: int, perceived_blur: float | None = None) -> float:
+    """Signed standard deviation of a sub-image's blur: eq. 13, or without a factor the fitted one."""
+    if i == 0:
+        return 0.0
+    n = abs(i)
+    return float(np.sign(i)) * (FITTED[n] if perceived_blur is None else perceived_blur * 0.85 * 2 ** (n - 1))
+
+
+def gaussian_fit(profile: np.ndarray, at: float) -> float:
+    """Sigma of the Gaussian around `at` that fits a profile best, by least squares."""
+    y = np.arange(len(profile)) - at
+    profile = profile / profile.sum()
+
+    def error(sigma: float) -> float:
+        bell = np.exp(-0.5 * (y / sigma) ** 2)
+        return float(((profile - bell / bell.sum()) ** 2).sum())
+
+    return float(minimize_scalar(error, bounds=(0.3, len(profile) / 4), method="bounded").x)
+
+
+def fitted_sigma(steps: int) -> tuple[float, float, float]:
+    """Least, mean and largest sigma of `blur` over all positions of a point in the pyramid."""
+    reach = 4 * 2**steps
+    sigmas = []
+    for at in range(reach - 2**steps // 2, reach + 2**steps // 2):
+        line = np.zeros((2 * reach, 2**steps))
+        line[at] = 1.0
+        sigmas.append(gaussian_fit(blur(line, steps)[:, 0], at))
+    return min(sigmas), float(np.mean(sigmas)), max(sigmas)
+
+
+def mattings(
+    first: int, last: int, rule_last: int, c1: float, c0: float, *, paper: bool, perceived_blur: float | None
+) -> dict[int, Matting]:
+    """Matting functions of sub-images `first` to `last`; `rule_last` is imax."""
+    if c1 == 0.0:
+        return {i: Matting(ones, ones) for i in range(first, last + 1)}
+
+    def r(i: int) -> float:
+        return radius(i, perceived_blur)
+
+    def z(i: int) -> float:
+        if i == 0 and c0 == 0.0:
+            return 1e3 * z(-1)
+        inverse = (2.0 * r(i) - c0) / c1
+        return 1.0 / inverse if inverse > 0 else np.inf
+
+    if paper:
+        return {i: paper_matting(i, first, rule_last, z) for i in range(first, last + 1)}
+    return {
+        i: seamless_matting(i, first, rule_last, r, c1, c0, lambda i: abs(radius(i))) for i in range(first, last + 1)
+    }
 
 
 # --- sub-images ---------------------------------------------------------------------------------------------------
