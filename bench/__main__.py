@@ -26,7 +26,8 @@ def main() -> int:
             return 0
         parser = argparse.ArgumentParser(prog="bench", description=__doc__)
         add_arguments(parser)
-        return bench(parser.parse_args())
+        bench(parser.parse_args())
+        return 0
     except CldofError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 2

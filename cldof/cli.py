@@ -175,6 +175,16 @@ def _parser() -> argparse.ArgumentParser:
         "methods", help="list methods and their options", description="List methods and their options."
     )
     methods.set_defaults(run=_methods)
+    from .benchmark.command import add_arguments
+
+    bench = commands.add_parser(
+        "bench",
+        help="measure accuracy and time of every method on every device",
+        description="Measure scenes x methods x settings x devices; write JSON, tables, plots and one HTML page.",
+    )
+    bench.set_defaults(run=_bench)
+    add_arguments(bench)
+
     devices = commands.add_parser("devices", help="list OpenCL devices", description="List OpenCL devices.")
     devices.set_defaults(run=_devices)
     scenes = commands.add_parser("scenes", help="list built-in scenes", description="List built-in scenes.")
@@ -202,6 +212,12 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    from .benchmark.command import bench
+
+    bench(arguments)
 
 
 def _devices(arguments: argparse.Namespace) -> None:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ..errors import InputError
-from .analysis import case_table, summary_table, text_table
-from .harness import Settings, print_progress, run
-from .page import save_page
-from .plots import has_matplotlib, save_plots
-from .record import Record
+from ..errors import CldofError, InputError
+
+if TYPE_CHECKING:
+    from .harness import Settings
+    from .record import Record
 
 __all__ = ["add_arguments", "bench", "report"]
 
@@ -43,8 +42,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the lens points (default 0)")
 
 
-def bench(arguments: argparse.Namespace) -> int:
-    """Run what the arguments say; 1 when a row gave a wrong image, else 0."""
+def bench(arguments: argparse.Namespace) -> None:
+    """Run what the arguments say.
+
+    Raises
+    ------
+    CldofError
+        After everything is written, when a row gave an image that cannot be right.
+    """
+    from .harness import print_progress, run
+    from .record import Record
+
     folder = Path(arguments.output)
     if not arguments.report_only:
         settings = settings_from(arguments)
@@ -57,16 +65,16 @@ def bench(arguments: argparse.Namespace) -> int:
         run(settings, folder / RESULTS, print_progress)
     record = Record.load(folder / RESULTS)
     report(record, folder)
-    wrong = [key for key, why in record.skipped.items() if "not timed" in why or "means nothing" in why]
-    for key in wrong:
-        print(f"WRONG OUTPUT {key}: {record.skipped[key]}", file=sys.stderr)
-    return 1 if wrong else 0
+    wrong = [f"{key}: {why}" for key, why in record.skipped.items() if "not timed" in why or "means nothing" in why]
+    if wrong:
+        raise CldofError(f"{len(wrong)} rows gave images that cannot be right. {' '.join(wrong)}")
 
 
 def settings_from(arguments: argparse.Namespace) -> Settings:
     """Defaults filled in."""
     from ..capture.scenes import builtin_scenes
     from ..methods import METHODS
+    from .harness import Settings
     from .ladders import ACCUMULATION
     from .peers import PEERS
 
@@ -98,6 +106,10 @@ def _size(text: str) -> tuple[int, int]:
 
 def report(record: Record, folder: Path) -> None:
     """Print the tables; write plots and page into the folder."""
+    from .analysis import case_table, summary_table, text_table
+    from .page import save_page
+    from .plots import has_matplotlib, save_plots
+
     width = shutil.get_terminal_size((160, 24)).columns
     for case in record.cases:
         heads, cells = case_table(record, case)
