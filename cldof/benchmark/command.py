@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 __all__ = ["add_arguments", "bench", "report"]
 
 RESULTS = "results.json"
-QUICK_SCENES = ("row", "fence")
-QUICK_PEER_SCENES = ("row",)
-PEER_SCENES = ("row", "fence")
+QUICK_SCENES: tuple[str, ...] = ("row", "fence")
+QUICK_PEER_SCENES: tuple[str, ...] = ("row",)
+PEER_SCENES: tuple[str, ...] = ("row", "fence")
 _QUICK_SIZE, _SIZE = (256, 256), (512, 512)
 _QUICK_VIEWS, _VIEWS = 256, 2048
 
@@ -84,6 +84,9 @@ def settings_from(arguments: argparse.Namespace) -> Settings:
         if value is not None and value < least:
             raise InputError(f"--{name.replace('_', '-')} is {value}; it must be at least {least}.")
     scenes = arguments.scenes or (QUICK_SCENES if quick else tuple(builtin_scenes()))
+    peer_scenes = QUICK_PEER_SCENES if quick else PEER_SCENES
+    if arguments.scenes:
+        peer_scenes = tuple(scene for scene in scenes if scene in PEER_SCENES) or tuple(scenes)
     return Settings(
         scenes=tuple(scenes),
         sizes=tuple(map(_size, arguments.sizes)) if arguments.sizes else (_QUICK_SIZE if quick else _SIZE,),
@@ -93,7 +96,7 @@ def settings_from(arguments: argparse.Namespace) -> Settings:
         reference_views=arguments.reference_views or (_QUICK_VIEWS if quick else _VIEWS),
         seed=arguments.seed,
         quick=quick,
-        peer_scenes=tuple(arguments.scenes or (QUICK_PEER_SCENES if quick else PEER_SCENES)),
+        peer_scenes=peer_scenes,
     )
 
 

@@ -44,6 +44,8 @@ GAUSSIAN_METHODS = frozenset({"layered", "pyramid"})
 # Alpha of an opaque frame may be off by this much, and colour below zero by rounding.
 _ALPHA_TOLERANCE = 2e-3
 _NEGATIVE_TOLERANCE = 1e-3
+# Above so many views accumulation is judged by its own kind of reference only: each other one is an image more.
+_OTHER_JUDGES_UP_TO = 256
 
 Image = NDArray[np.float32]
 Progress = Callable[[str], None]
@@ -144,7 +146,8 @@ def _jobs_of(method: str, case: CaseKey, settings: Settings, devices: Sequence[D
                 yield Job(f"{case}|{method}|{name}", case, method, name, 3.0 + 8.0 * megapixels)
     elif method == ACCUMULATION:
         for views in ladders.accumulation_views(settings.quick):
-            cost = 2 * views * _view_s(megapixels)
+            images = 4 if views <= _OTHER_JUDGES_UP_TO else 1
+            cost = (images + (views <= 64)) * views * _view_s(megapixels)
             yield Job(f"{case}|{method}|{views} views", case, method, f"{views} views", cost, views=views)
     else:
         for device in devices:
@@ -394,6 +397,8 @@ class _Bench:
             ("disc", "disc", False),
             ("disc picture", "disc", True),
         ):
+            if judge != "method" and job.views > _OTHER_JUDGES_UP_TO:
+                continue
             own = image if judge == "method" else case.accumulated(job.views, aperture, jitter, seed).image
             found = compare(own, self._reference(case, aperture, jitter), frame, case.lens)
             errors[judge] = _floats(found)
