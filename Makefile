@@ -19,7 +19,7 @@ help:
 demo:
 	@scripts/setup.sh core
 	@mkdir -p out
-	@$(VENV)/cldof render foliage -o out/demo.png --pinhole out/demo-pinhole.png --size 1024x768 \
+	@$(VENV)/cldof render foliage -o out/demo.png --pinhole out/demo-pinhole.png --size 1024x768 --supersample 2 \
 		$(if $(DEVICE),--device "$(DEVICE)")
 
 test:
