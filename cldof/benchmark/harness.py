@@ -165,9 +165,9 @@ def _view_s(megapixels: float) -> float:
     return 0.008 + 0.06 * megapixels
 
 
-def estimate_s(jobs: Sequence[Job], settings: Settings) -> float:
-    """Rough seconds on two CPU cores, references included."""
-    cases = {job.case for job in jobs}
+def estimate_s(jobs: Sequence[Job], settings: Settings, begun: CaseKey | None = None) -> float:
+    """Rough seconds on two CPU cores, references included but for the case that has begun."""
+    cases = {job.case for job in jobs} - {begun}
     references = sum(
         4.0 + 4 * settings.reference_views * _view_s(case.width * case.height / 1e6) + 3.0 for case in cases
     )
@@ -231,7 +231,7 @@ def run(settings: Settings, path: Path, progress: Progress, devices: Sequence[De
         for number, job in enumerate(todo, 1):
             bench.do(job)
             record.save(path)
-            left_s = estimate_s(todo[number:], settings)
+            left_s = estimate_s(todo[number:], settings, job.case)
             spent = time.perf_counter() - started
             pace = spent / max(estimated - left_s, 1e-9)
             done = record.rows.get(job.key)
