@@ -8,6 +8,7 @@ from ..errors import InputError
 from .base import FrameShape, Method, Plan
 from .gather import Gather
 from .layered import Layered
+from .multiview import Multiview
 from .pyramid import Pyramid
 
 __all__ = ["METHODS", "FrameShape", "Method", "Plan", "make_method"]
@@ -16,6 +17,7 @@ __all__ = ["METHODS", "FrameShape", "Method", "Plan", "make_method"]
 METHODS: dict[str, type[Any]] = {
     "gather": Gather,
     "layered": Layered,
+    "multiview": Multiview,
     "pyramid": Pyramid,
 }
 

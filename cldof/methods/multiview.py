@@ -1,0 +1,408 @@
+"""Multiview synthesis (Lee, Eisemann & Seidel 2009): lens rays traced through a layered image-based scene.
+
+The peels are split into layers of equal growth of the signed circle of confusion (eq. 4). Each pixel sends one ray per
+lens sample, which meets the layers front to back and is thickened to a cone as wide as the samples are apart
+(section 4.4). Rays that meet what lies outside of the frame, or what no peel holds, are dropped and the rest
+renormalised. The aperture may have any shape.
+
+Where this differs from the paper, docs/methods/multiview.md has the measurements:
+
+- Layers are thin (half a pixel of CoC where 32 of them allow it), so that a ray meets each at one place and needs no
+  search by false position. All pixels of a run then move alike, and look-ups are contiguous.
+- Layers overlap as far as the surface slopes from pixel to pixel, not by a fixed 10 %.
+- Cones see means over windows of exactly their width, not mip levels.
+- Look-ups are rounded to whole pixels with an offset that differs from ray to ray, which softens as half a bilinear
+  filter would, for nothing.
+- The number of rays follows the blur of what a cell of 16 x 16 pixels can see.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..frame import LayeredFrame
+from ..host.device import Traits
+from ..host.passes import Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
+from ..lens import Aperture, Lens
+from .base import FrameShape, Plan
+
+__all__ = ["CELL", "MAX_LAYERS", "MAX_RAYS", "Cone", "LensLayers", "Multiview", "RaySets", "cones", "ray_sets"]
+
+# Constants of kernels/multiview.cl.
+MAX_LAYERS = 32
+CELL = 16
+_HALO = 16
+_RUN = 64
+
+MAX_RAYS = 1024
+
+# CoC growth from layer to layer (px) when none is given. Thinner layers gain less than 0.3 dB.
+_USUAL_DELTA_PX = 0.5
+# Growth rises on this grid, so that a lens in motion keeps to few pass lists.
+_STEPS_PER_OCTAVE = 8
+# Layers may not take more than this on the device; there are then fewer of them.
+_LAYER_BYTES = 1 << 30
+_FEWEST_LAYERS = 5
+
+# Width of a cone over the mean distance of lens samples.
+_CONE_WIDTH = 1.2
+# Width in px of the offsets by which look-ups are rounded.
+_ROUNDING = 0.5
+# Rays per px^2 of the largest circle of confusion that a cell can see, below which the number of rays is cut.
+_RAYS_PER_PX2 = 2.0
+# Pixels of the jitter pattern along x and y.
+_JITTER = 4
+
+_SIZE = np.dtype([(n, np.int32) for n in ("width", "height", "pitch", "peels", "layers", "cells_x", "cells_y")])
+_FLOAT = np.dtype(np.float32)
+# Farther than any CoC in px, nearer than slots with nothing in them: the first and last layers have no end.
+_ENDLESS = 1e20
+
+
+class LensLayers(NamedTuple):
+    """Which layers there are, and through what aperture they are seen."""
+
+    front: int
+    back: int
+    delta_px: float
+    aperture: Aperture
+
+    @property
+    def total(self) -> int:
+        """K."""
+        return self.front + 1 + self.back
+
+    @property
+    def coc(self) -> NDArray[np.float64]:
+        """Signed CoC radius in px at which rays meet each layer, (K,), rising; 0 for the layer in focus."""
+        return np.arange(-self.front, self.back + 1) * self.delta_px
+
+    @property
+    def bounds(self) -> NDArray[np.float32]:
+        """CoC in px where layers begin, (K + 1,); layer k reaches from ``bounds[k]`` to ``bounds[k + 1]``."""
+        bounds = (np.arange(-self.front, self.back + 2) - 0.5) * self.delta_px
+        bounds[0], bounds[-1] = -_ENDLESS, _ENDLESS
+        return bounds.astype(np.float32)
+
+
+class Cone(NamedTuple):
+    """Window of a mean: ``2 * radius + 1`` whole pixels and ``edge`` of one more at either side."""
+
+    radius: int
+    edge: float
+
+
+class RaySets(NamedTuple):
+    """Rays of all sets as the kernels take them.
+
+    Attributes
+    ----------
+    ranges : ndarray of int32, (sets * patterns, 2)
+        First ray and number of rays.
+    shifts : ndarray of int32, (rays, K, 2)
+        How many pixels right and down each ray has moved at each layer.
+    needs : ndarray of int32, (K,)
+        Which set the blur of a layer asks for.
+    """
+
+    ranges: NDArray[np.int32]
+    shifts: NDArray[np.int32]
+    needs: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Multiview:
+    """Options of the multiview method.
+
+    Parameters
+    ----------
+    rays : int
+        Rays per pixel, 1 to 1024: points on the lens.
+    layers : int
+        The most layers K, 5 to 32. Growth rises when the CoC range asks for more.
+    delta_px : float, optional
+        CoC growth from one layer to the next in px (delta of eq. 4), at least 0.1. None: 0.5.
+    cone : bool
+        Thicken rays to cones. False leaves the grain of single rays.
+    jitter : bool
+        Give the pixels of each block of 4 x 4 different sets of rays: what would be copies of an edge becomes noise.
+    adaptive : bool
+        Trace fewer rays where all that can be seen is little blurred.
+    cull : bool
+        Walk the layers that a cell can see, not all. Changes no pixel; False is for measurements.
+    seed : int
+        Of the lens samples.
+    """
+
+    rays: int = 64
+    layers: int = MAX_LAYERS
+    delta_px: float | None = None
+    cone: bool = True
+    jitter: bool = False
+    adaptive: bool = True
+    cull: bool = True
+    seed: int = 0
+
+    name = "multiview"
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("rays", 1, MAX_RAYS), ("layers", _FEWEST_LAYERS, MAX_LAYERS), ("seed", 0, 2**31 - 1)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+                raise InputError(f"multiview: {name} is {value!r}; it must be a whole number from {low} to {high}.")
+        delta = self.delta_px
+        if delta is not None and not (isinstance(delta, int | float) and 0.1 <= delta < math.inf):
+            raise InputError(f"multiview: delta_px is {delta!r}; it must be a number of at least 0.1 px.")
+
+    def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
+        """Choose the layers from the CoC range."""
+        c1, c0 = lens.coc_coefficients(frame.camera)
+        farthest, nearest = frame.inverse_depth_range
+        if not frame.is_opaque:
+            farthest = 0.0  # the void is a surface at infinity
+        near_px, far_px = max(0.0, -(c1 * nearest + c0)), max(0.0, c1 * farthest + c0)
+        shape = FrameShape.of(frame)
+        most = min(self.layers, max(_FEWEST_LAYERS, _LAYER_BYTES // (shape.height * shape.pitch * 16) - 2))
+        layers = _layers(near_px, far_px, self.delta_px or _USUAL_DELTA_PX, most, lens.aperture)
+        summary = {
+            "method": self.name,
+            **{field.name: getattr(self, field.name) for field in fields(self)},
+            "layers": layers.total,
+            "focus_layer": layers.front,
+            "delta_px": layers.delta_px,
+            "largest_near_coc_px": near_px,
+            "largest_far_coc_px": far_px,
+        }
+        return Plan(layers, {"c1": np.float32(c1), "c0": np.float32(c0)}, summary)
+
+    def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
+        """Declare the frame's passes."""
+        layers = plan.structure
+        assert isinstance(layers, LensLayers)
+        return _Builder(self, shape, layers, traits).build()
+
+
+def _layers(near_px: float, far_px: float, delta_px: float, most: int, aperture: Aperture) -> LensLayers:
+    for exponent in range(10**6):
+        delta = delta_px * math.pow(2.0, exponent / _STEPS_PER_OCTAVE)
+        # The layer in focus takes half a step of either side.
+        front, back = (max(0, math.ceil(px / delta - 0.5)) for px in (near_px, far_px))
+        if front + 1 + back <= most:
+            return LensLayers(front, back, delta, aperture)
+    raise AssertionError("a step that is large enough needs one layer a side")
+
+
+def cones(layers: LensLayers, rays: int) -> list[Cone | None]:
+    """Window of each layer's cones; None where they are no wider than a pixel."""
+    # A uniform disc has a variance of 1/4 along each axis and an area of pi.
+    deviations = layers.aperture.samples(256).std(axis=0)
+    distance = math.sqrt(4.0 * math.pi * float(deviations.prod()) / rays)
+    windows: list[Cone | None] = []
+    for coc in np.abs(layers.coc).tolist():
+        half = min((_CONE_WIDTH * distance * coc - 1.0) / 2.0, _HALO - 2.0)
+        windows.append(Cone(int(half), half - int(half)) if half > 0.0 else None)
+    return windows
+
+
+def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
+    """Shifts of all rays at all layers.
+
+    The first set has one ray, for cells in focus; then, when adaptive, come powers of two below ``rays``; then ``rays``.
+    With jitter there are 16 patterns of each.
+    """
+    counts = [1]
+    if method.adaptive:
+        counts += [1 << n for n in range(2, 10) if 1 << n < method.rays]
+    counts.append(method.rays)
+    patterns = _JITTER**2 if method.jitter else 1
+    ranges, shifts = [], []
+    first = 0
+    for count in counts:
+        for pattern in range(patterns):
+            ranges.append((first, count))
+            shifts.append(_shifts(layers, count, method.seed * patterns + pattern))
+            first += count
+    all_shifts = np.concatenate(shifts)
+    moves = np.abs(shifts[-1]).max(axis=(0, 2)) > 0 if patterns == 1 else np.abs(all_shifts).max(axis=(0, 2)) > 0
+    needs = np.full(layers.total, len(counts) - 1)
+    if method.adaptive:
+        wanted = _RAYS_PER_PX2 * math.pi * (np.abs(layers.coc) + 0.5) ** 2
+        needs = np.minimum(np.maximum(np.searchsorted(counts, wanted), 1), len(counts) - 1)
+    needs[~moves] = 0
+    return RaySets(np.array(ranges, np.int32), all_shifts, needs.astype(np.int32))
+
+
+def _shifts(layers: LensLayers, count: int, seed: int) -> NDArray[np.int32]:
+    # The ray through lens point v meets C at p + C * (-v.x, v.y), y down.
+    points = layers.aperture.samples(count, seed) * (-1.0, 1.0)
+    index = np.arange(count)
+    root = 1.32471795724474602596  # Roberts' R2 sequence, unrelated to the spiral of the lens
+    offsets = (0.5 + index[:, None] / (root, root * root)) % 1.0 - 0.5
+    places = points[:, None] * layers.coc[None, :, None] + np.where(layers.coc != 0.0, _ROUNDING, 0.0)[:, None] * (
+        offsets[:, None]
+    )
+    return np.asarray(np.floor(places + 0.5), dtype=np.int32)
+
+
+class _Builder:
+    """Lists the passes of one frame."""
+
+    def __init__(self, method: Multiview, shape: FrameShape, layers: LensLayers, traits: Traits) -> None:
+        self.method, self.shape, self.layers = method, shape, layers
+        self.is_cpu = traits.is_cpu
+        self.cells = (-(-shape.width // CELL), -(-shape.height // CELL))
+        values = (shape.width, shape.height, shape.pitch, shape.layers, layers.total, *self.cells)
+        record: Any = np.array(values, _SIZE)
+        self.size = record[()]
+        self.lens = (Param("c1", _FLOAT), Param("c0", _FLOAT))
+        self.stride = _JITTER if method.jitter else 1
+        self.defines = (("MULTIVIEW_VOID", int(not shape.is_opaque)), ("MULTIVIEW_STRIDE", self.stride))
+        self.peel_bytes = shape.layers * shape.height * shape.pitch * 4
+        self.layer_bytes = shape.height * shape.pitch * 16
+        self.levels = max(self.cells).bit_length()
+        self.passes: list[Pass] = []
+        slots = layers.total + (not shape.is_opaque)
+        cell_bytes = self.cells[0] * self.cells[1] * 4
+        self.buffers = [
+            Buffer("color", shape.layers * shape.height * shape.width * 16, Role.INPUT),
+            Buffer("inv_depth", self.peel_bytes, Role.INPUT),
+            Buffer("image", math.prod(shape.output_size) * 16, Role.OUTPUT),
+            Buffer("extent", self.peel_bytes),
+            Buffer("nbuffer", self.levels * cell_bytes),
+            Buffer("lists", cell_bytes),
+            Buffer("sets", cell_bytes),
+            Buffer("layers", slots * self.layer_bytes),
+        ]
+
+    def build(self) -> FrameProgram:
+        windows = cones(self.layers, self.method.rays) if self.method.cone else [None] * self.layers.total
+        rays = ray_sets(self.method, self.layers)
+        self._classify(windows, rays)
+        self._split(windows)
+        self._trace(rays)
+        return FrameProgram.of(self.buffers, self.passes)
+
+    def _classify(self, windows: list[Cone | None], rays: RaySets) -> None:
+        """Which layers a cell can see."""
+        shape = self.shape
+        self._add(
+            "multiview_extent",
+            (write("extent"), read("inv_depth"), self.size, *self.lens),
+            (shape.pitch // 16, shape.height, shape.layers),
+            2 * self.peel_bytes,
+        )
+        low = np.float32((-self.layers.front - 0.5) * self.layers.delta_px)
+        delta = np.float32(self.layers.delta_px)
+        self._add(
+            "multiview_cells",
+            (write("nbuffer"), read("inv_depth"), read("extent"), self.size, *self.lens, low, delta),
+            self.cells,
+            2 * self.peel_bytes,
+        )
+        for level in range(1, self.levels):
+            self._add("multiview_nbuffer", (read_write("nbuffer"), self.size, np.int32(level)), self.cells)
+        moves = np.abs(rays.shifts).max(axis=(0, 2))
+        halos = np.array([window.radius + 1 if window else 0 for window in windows])
+        self._constant("reach", (-(-(moves + halos) // CELL)).astype(np.int32))
+        self._constant("needs", rays.needs)
+        self._add(
+            "multiview_lists",
+            (
+                write("lists"),
+                write("sets"),
+                read("nbuffer"),
+                read("reach"),
+                read("needs"),
+                self.size,
+                np.int32(self.levels),
+                np.int32(self.method.cull),
+            ),
+            self.cells,
+        )
+
+    def _split(self, windows: list[Cone | None]) -> None:
+        """Fill the layers, as cones see them."""
+        if any(windows):
+            self.buffers.append(Buffer("split", self.layer_bytes))
+        bounds = self.layers.bounds
+        for layer, window in enumerate(windows):
+            stack = write("layers") if layer == 0 else read_write("layers")
+            number = np.int32(layer)
+            self._add(
+                "multiview_split",
+                (
+                    stack if window is None else write("split"),
+                    read("color"),
+                    read("inv_depth"),
+                    read("extent"),
+                    read("nbuffer"),
+                    self.size,
+                    *self.lens,
+                    bounds[layer],
+                    bounds[layer + 1],
+                    number,
+                    number if window is None else np.int32(0),
+                ),
+                self.cells,
+                self.layer_bytes,
+            )
+            if window is None:
+                continue
+            self._add(
+                "multiview_cone",
+                (
+                    stack,
+                    read("split"),
+                    read("nbuffer"),
+                    self.size,
+                    number,
+                    number,
+                    np.int32(window.radius),
+                    np.float32(window.edge),
+                ),
+                (-(-self.shape.pitch // _RUN), self.cells[1]),
+                2 * self.layer_bytes,
+            )
+        if not self.shape.is_opaque:
+            self._add(
+                "multiview_past",
+                (read_write("layers"), read("color"), self.size, np.int32(self.layers.total)),
+                (1, self.shape.height),
+                self.layer_bytes,
+            )
+
+    def _trace(self, rays: RaySets) -> None:
+        self._constant("ray_sets", rays.ranges)
+        self._constant("shifts", rays.shifts)
+        height, width = self.shape.output_size
+        self._add(
+            "multiview_trace",
+            (
+                write("image"),
+                read("layers"),
+                read("lists"),
+                read("sets"),
+                read("ray_sets"),
+                read("shifts"),
+                self.size,
+                np.int32(self.shape.guard_px),
+            ),
+            (-(-self.shape.width // (16 * self.stride)), height),
+            height * width * 16 * (self.method.rays + 1),
+        )
+
+    def _constant(self, name: str, data: NDArray[np.int32]) -> None:
+        data = np.ascontiguousarray(data)
+        self.buffers.append(Buffer(name, data.nbytes, Role.CONSTANT, data))
+
+    def _add(self, kernel: str, args: tuple[Any, ...], extent: tuple[int, ...], traffic_bytes: int = 0) -> None:
+        local_size = (1,) * len(extent) if self.is_cpu else None  # every new local size costs PoCL a compilation
+        self.passes.append(
+            Pass("multiview", kernel, args, extent, local_size, self.defines, traffic_bytes=traffic_bytes)
+        )
