@@ -99,8 +99,22 @@ class Aperture(ABC):
             raise InputError(f"seed is {seed!r}; it must be a whole number, at least 0.")
         index = np.arange(int(count))
         offset = np.random.default_rng(int(seed)).random(2)
-        points = self._place((index + offset[0]) / count, (index * _GOLDEN + offset[1]) % 1.0)
-        return np.asarray(points * (min(1.0, 1.0 / self.ratio), min(1.0, self.ratio)), dtype=np.float64)
+        return self.place((index + offset[0]) / count, (index * _GOLDEN + offset[1]) % 1.0)
+
+    def place(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map evenly spread points of the unit square to the lens, equal areas to equal light, and centre them.
+
+        Parameters
+        ----------
+        u, v : ndarray, (N,), float64
+            In [0, 1).
+
+        Returns
+        -------
+        ndarray, (N, 2), float64
+            As :func:`lens_samples`.
+        """
+        return np.asarray(self._place(u, v) * (min(1.0, 1.0 / self.ratio), min(1.0, self.ratio)))
 
     @abstractmethod
     def _place(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:

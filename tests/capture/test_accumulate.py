@@ -9,7 +9,9 @@ import math
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.stats import qmc
 
+import cldof.capture.accumulate as accumulate_module
 from cldof import Camera, Lens
 from cldof.capture.accumulate import accumulate, view_plan
 from cldof.capture.peel import DepthPeeler
@@ -165,6 +167,26 @@ def test_few_views_differ_from_many_by_their_noise_floor(peeler: DepthPeeler) ->
         assert psnr(some.image, many.image) == pytest.approx(floors[1], abs=2.5)
         assert one_pattern.noise_floor_db is None
         assert psnr(one_pattern.image, many.image) > floors[0] - 2.5
+
+
+class Zeros:
+    """A generator that scrambles nothing."""
+
+    def integers(self, low: int, high: int, size: tuple[int, ...] | None = None) -> np.ndarray | int:
+        return np.zeros(size, np.int64) if size else 0
+
+
+def test_jittered_views_are_sobols(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = accumulate_module._scrambled_sobol(64, 5)
+    assert not np.array_equal(points, accumulate_module._scrambled_sobol(64, 6))
+    np.testing.assert_array_equal(points[:40], accumulate_module._scrambled_sobol(40, 5))
+    # However it is scrambled: any 64 points have one in each 64th of an axis, and one in each 8x8 of the first two.
+    np.testing.assert_array_equal(np.sort(np.floor(points * 64.0), axis=0), np.arange(64)[:, None] * np.ones(4))
+    cells = np.floor(points[:, :2] * 8.0) @ (8.0, 1.0)
+    np.testing.assert_array_equal(np.sort(cells), np.arange(64))
+    monkeypatch.setattr(np.random, "default_rng", lambda seed: Zeros())
+    plain, expected = accumulate_module._scrambled_sobol(64, 5), qmc.Sobol(4, scramble=False).random(64)
+    np.testing.assert_array_equal(plain[np.lexsort(plain.T)], expected[np.lexsort(expected.T)])
 
 
 def test_what_a_reference_says_of_itself(peeler: DepthPeeler) -> None:
