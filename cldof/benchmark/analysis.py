@@ -26,15 +26,22 @@ __all__ = [
 
 
 class EqualError(NamedTuple):
-    """Accumulation that errs as much as a row: its milliseconds and views; ``bound`` is "<", ">" or ""."""
+    """Accumulation that errs as much as a row: milliseconds, views, CPU time; ``bound`` is "<", ">" or ""."""
 
     ms: float
     views: float
     bound: str
+    cpu_ms: float | None = None
+
+    def ratio(self, row: Row) -> float:
+        """How many times less a row takes: by processor time where both have it, else by the clock."""
+        if self.cpu_ms is not None and row.cpu_ms:
+            return self.cpu_ms / row.cpu_ms
+        return self.ms / row.total_ms
 
     def speed_up(self, row: Row) -> str:
-        """How many times faster the row is, as text."""
-        return f"{self.bound}{self.ms / row.total_ms:.2g}x"
+        """:meth:`ratio` as text."""
+        return f"{self.bound}{self.ratio(row):.2g}x"
 
 
 def equal_error(record: Record, row: Row, judge: str = "method") -> EqualError | None:
@@ -48,19 +55,26 @@ def equal_error(record: Record, row: Row, judge: str = "method") -> EqualError |
     for one in record.rows_of(row.case):
         psnr = one.error("psnr_db", own)
         if one.method == ACCUMULATION and one.views and psnr is not None:
-            points.append((psnr, one.total_ms, one.views))
+            points.append((psnr, one.total_ms, one.views, one.cpu_ms))
     if wanted is None or not points or row.method == ACCUMULATION:
         return None
     points.sort(key=lambda point: point[2])
     # More views are never worse: noise of the ladder must not make it turn back.
     levels = np.maximum.accumulate([min(point[0], 1e3) for point in points])
-    if wanted > levels[-1]:
-        return EqualError(points[-1][1], points[-1][2], ">")
-    if wanted < levels[0]:
-        return EqualError(points[0][1], points[0][2], "<")
-    ms = math.exp(float(np.interp(wanted, levels, np.log([point[1] for point in points]))))
-    views = math.exp(float(np.interp(wanted, levels, np.log([point[2] for point in points]))))
-    return EqualError(ms, views, "")
+    if wanted > levels[-1] or wanted < levels[0]:
+        _, ms, views, cpu_ms = points[-1 if wanted > levels[-1] else 0]
+        return EqualError(ms, views, ">" if wanted > levels[-1] else "<", cpu_ms)
+
+    def at(values: list[float]) -> float:
+        return math.exp(float(np.interp(wanted, levels, np.log(values))))
+
+    cpu = [point[3] for point in points if point[3] is not None]
+    return EqualError(
+        at([point[1] for point in points]),
+        at([float(point[2]) for point in points]),
+        "",
+        at(cpu) if len(cpu) == len(points) else None,
+    )
 
 
 def _judge_of_accumulation(row: Row, judge: str) -> str:
@@ -103,6 +117,7 @@ def columns(many_devices: bool = True) -> tuple[Column, ...]:
         Column("setting", "", lambda _, row: row.setting),
         *(device if many_devices else ()),
         Column("total ms", "scene to image: capture and steady frame, medians", lambda _, row: row.total_ms, ".1f"),
+        Column("cpu ms", "processor time of the same, all cores", lambda _, row: row.cpu_ms, ".0f"),
         Column("capture", "drawing the layers, ms", lambda _, row: _median(row.capture), ".1f"),
         Column("frame", "host arrays to host image, ms", lambda _, row: _median(row.wall), ".1f"),
         Column("least", "the quickest of those frames, ms", lambda _, row: row.wall and row.wall.min, ".1f"),
@@ -138,7 +153,7 @@ def columns(many_devices: bool = True) -> tuple[Column, ...]:
         ),
         Column(
             "speed-up",
-            "over accumulation of equal PSNR; > and < where its ladder ends",
+            "over accumulation of equal PSNR, by CPU time if known; > and < where its ladder ends",
             lambda record, row: None if (found := _equal(record, row)) is None else found.speed_up(row),
         ),
     )
@@ -177,7 +192,17 @@ def markdown_table(heads: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
 
 def layered_table(record: Record, case: str) -> tuple[list[str], list[list[str]]]:
     """The paper's comparison (Schedl & Wimmer 2012, tables 1-2): layered, cascaded and not, beside accumulation."""
-    heads = ["method", "setting", "total ms", "kernels ms", "PSNR dB", "SSIM", "accumulation of equal PSNR", "speed-up"]
+    heads = [
+        "method",
+        "setting",
+        "total ms",
+        "CPU ms",
+        "frame ms",
+        "PSNR dB",
+        "SSIM",
+        "accumulation of equal PSNR",
+        "speed-up",
+    ]
     cells = []
     for row in record.rows_of(case):
         if row.method not in ("layered", ACCUMULATION):
@@ -189,7 +214,8 @@ def layered_table(record: Record, case: str) -> tuple[list[str], list[list[str]]
                 row.method,
                 row.setting,
                 f"{row.total_ms:.1f}",
-                "-" if row.kernels is None else f"{row.kernels.median:.1f}",
+                "-" if row.cpu_ms is None else f"{row.cpu_ms:.0f}",
+                "-" if row.capture is None or row.wall is None else f"{row.wall.median:.1f}",
                 "-" if psnr is None else f"{psnr:.2f}",
                 "-" if ssim is None else f"{ssim:.4f}",
                 "-" if equal is None else f"{equal.bound}{equal.views:.0f} views, {equal.bound}{equal.ms:.0f} ms",
@@ -207,6 +233,7 @@ def summary_table(record: Record, unlit: bool = False) -> tuple[list[str], list[
         "size",
         "scenes",
         "total ms",
+        "CPU ms",
         "frame ms",
         "PSNR dB",
         "worst",
@@ -223,7 +250,7 @@ def summary_table(record: Record, unlit: bool = False) -> tuple[list[str], list[
     cells = []
     for (method, setting, size, _), rows in groups.items():
         found = [(equal, row) for row in rows if (equal := equal_error(record, row)) is not None]
-        ratios = [equal.ms / row.total_ms for equal, row in found]
+        ratios = [equal.ratio(row) for equal, row in found]
         bound = {equal.bound for equal, _ in found}
         cells.append(
             [
@@ -232,6 +259,7 @@ def summary_table(record: Record, unlit: bool = False) -> tuple[list[str], list[
                 size,
                 str(len(rows)),
                 _middle([row.total_ms for row in rows], ".1f"),
+                _middle(_known(row.cpu_ms for row in rows), ".0f"),
                 _middle([row.wall.median for row in rows if row.wall], ".1f"),
                 _middle(_known(row.error("psnr_db") for row in rows), ".2f"),
                 _least(_known(row.error("psnr_db") for row in rows), ".2f"),

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -418,9 +418,8 @@ class _Bench:
 
     def _peer(self, job: Job, case: Case) -> tuple[Row, Image]:
         peer = peers.PEERS[job.method]
-        image, seconds, note = peer.draw(case, job.setting, self.settings.runs, self.settings.seed)
+        image, times, note = peer.draw(case, job.setting, self.settings.runs, self.settings.seed)
         verify(image, (case.key.height, case.key.width), opaque=False)
-        times = Times.of([1e3 * one for one in seconds])
         capture = case.frame(1)[1] if peer.needs_capture else None
         errors = self._errors(case, image, "disc")
         own = peer.converged(case)
@@ -470,13 +469,14 @@ def measure(
     """
     out = np.empty((*size, 4), np.float32)
     with Renderer(method, device=device, **options) as renderer:
-        first, _ = timed(lambda: renderer.render(_renewed(frame), lens, out), 1)
-        first_ms = first.wall_ms
+        first = renderer.render(_renewed(frame), lens, out)
         verify(first.image, size, frame.is_opaque)
         image = first.image.copy()
         for _ in range(2):  # the ring's other slots
             renderer.render(_renewed(frame), lens, out)
-        wall = [renderer.render(_renewed(frame), lens, out).wall_ms for _ in range(runs)]
+        _, wall = timed(lambda: renderer.render(_renewed(frame), lens, out), runs)
+        if not renderer.device.traits.is_cpu:
+            wall = replace(wall, cpu=None)
         if not np.array_equal(out, image):
             raise WrongOutputError(f"{method} gave another image for the same frame; its time means nothing.")
         peak = renderer.peak_device_bytes
@@ -485,8 +485,7 @@ def measure(
         kernels = [sum(timing.ms for timing in result.timings) for result in results]
         transfer = _transfers(renderer.device, frame, size, runs)
         traits = _traits(renderer.device)
-    walls = Times.of(wall)
-    return Measured(image, walls, Times.of(kernels), transfer, max(0.0, first_ms - walls.median), peak, traits)
+    return Measured(image, wall, Times.of(kernels), transfer, max(0.0, first.wall_ms - wall.median), peak, traits)
 
 
 def verify(image: Image, size: tuple[int, int], opaque: bool) -> None:

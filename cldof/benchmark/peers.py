@@ -21,9 +21,8 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +36,8 @@ from ..errors import CldofError
 from ..frame import LayeredFrame
 from ..images import linear_from_srgb, srgb_from_linear
 from ..lens import Lens
+from .cases import CaseKey, build_scene, timed
+from .record import Times
 
 if TYPE_CHECKING:
     from .cases import Case
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["PEERS", "Peer", "PeerMissingError"]
 
 Image = NDArray[np.float32]
-Drawn = tuple[Image, list[float], str]
+Drawn = tuple[Image, Times, str]
 
 _OPENCV_SLICES = 48
 _TIMEOUT_S = 300
@@ -98,7 +99,7 @@ class Peer:
             raise PeerMissingError(f"{self.name}: {', '.join(missing)} is not installed (pip install {self.install})")
 
     def draw(self, case: Case, setting: str, runs: int, seed: int) -> Drawn:
-        """The image, the seconds of each run, and a remark; all settings of a case are drawn at the first call."""
+        """The image, its times, and a remark; all settings of a case are drawn at the first call."""
         self.check()
         key = (case.key, runs, seed)
         if key in self._failed:
@@ -181,7 +182,11 @@ def _in_process(name: str, settings: tuple[str, ...], case: Case, runs: int, see
             raise PeerMissingError(f"{name}: does not run here (exit code {done.returncode}: {last[:200]})")
         with np.load(result, allow_pickle=False) as data:
             return {
-                setting: (data[f"image {setting}"], data[f"seconds {setting}"].tolist(), str(data[f"note {setting}"]))
+                setting: (
+                    data[f"image {setting}"],
+                    Times(**json.loads(str(data[f"times {setting}"]))),
+                    str(data[f"note {setting}"]),
+                )
                 for setting in (*settings, _CONVERGED)
                 if f"image {setting}" in data
             }
@@ -202,16 +207,14 @@ def _llvm() -> str | None:
 
 def _work(job_path: str, result_path: str) -> None:
     """The other process."""
-    from .cases import CaseKey, build_scene
-
     job = json.loads(Path(job_path).read_text(encoding="utf-8"))
     key = CaseKey(*job["case"])
     scene, lens = build_scene(key), Lens(*job["lens"])
     draw: Callable[..., dict[str, Drawn]] = {"mitsuba": _mitsuba, "vtk": _vtk}[job["peer"]]
     drawn = draw(scene, scene.camera_for(key.width, key.height), lens, job["settings"], job["runs"], job["seed"])
     arrays: dict[str, Any] = {}
-    for setting, (image, seconds, note) in drawn.items():
-        arrays |= {f"image {setting}": image, f"seconds {setting}": np.array(seconds), f"note {setting}": note}
+    for setting, (image, times, note) in drawn.items():
+        arrays |= {f"image {setting}": image, f"times {setting}": json.dumps(asdict(times)), f"note {setting}": note}
     np.savez(result_path, **arrays)
 
 
@@ -266,15 +269,11 @@ def _sky(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None
     return np.array(scene.background), np.array(scene.background)
 
 
-def _timed(draw: Callable[[], Image], runs: int, warm_up: int = 1) -> tuple[Image, list[float]]:
+def _timed(draw: Callable[[], Image], runs: int, warm_up: int = 1) -> tuple[Image, Times]:
     for _ in range(warm_up):
-        image = draw()
-    seconds = []
-    for _ in range(runs):
-        start = time.perf_counter()
-        image = draw()
-        seconds.append(time.perf_counter() - start)
-    return image, seconds
+        draw()
+    image, times = timed(draw, runs)
+    return image, times
 
 
 def _mitsuba(scene: Scene, camera: Camera, lens: Lens, settings: list[str], runs: int, seed: int) -> dict[str, Drawn]:
@@ -365,7 +364,7 @@ def _mitsuba(scene: Scene, camera: Camera, lens: Lens, settings: list[str], runs
     parts_of = [
         np.array(mi.render(world, spp=_CONVERGED_SAMPLES // 4, seed=seed + 1 + part), np.float64) for part in range(4)
     ]
-    drawn[_CONVERGED] = (np.mean(parts_of, axis=0).astype(np.float32), [], f"{_CONVERGED_SAMPLES} samples")
+    drawn[_CONVERGED] = (np.mean(parts_of, axis=0).astype(np.float32), Times.of([0.0]), f"{_CONVERGED_SAMPLES} samples")
     return drawn
 
 

@@ -34,20 +34,25 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Times:
-    """Milliseconds of several runs: the least, the median, and the distance between the quartiles."""
+    """Milliseconds of several runs: the least, the median, and the distance between the quartiles.
+
+    ``cpu`` is the median processor time, summed over cores, where the work is done on the CPU: on a machine that does
+    other things as well it says more than the clock.
+    """
 
     min: float
     median: float
     iqr: float
     runs: int
+    cpu: float | None = None
 
     @classmethod
-    def of(cls, ms: Sequence[float]) -> Times:
+    def of(cls, ms: Sequence[float], cpu_ms: Sequence[float] = ()) -> Times:
         """Summarise measurements; at least one."""
         if not ms:
             raise InputError("Times.of needs at least one measurement.")
         low, _, high = quantiles(ms, n=4, method="inclusive") if len(ms) > 1 else (0.0, 0.0, 0.0)
-        return cls(min(ms), median(ms), high - low, len(ms))
+        return cls(min(ms), median(ms), high - low, len(ms), median(cpu_ms) if cpu_ms else None)
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,13 @@ class Row:
     peak_device_bytes: int | None = None
     input_bytes: int | None = None
     note: str = ""
+
+    @property
+    def cpu_ms(self) -> float | None:
+        """Processor time of what ``total_ms`` counts, where all of it was measured."""
+        parts = [times.cpu for times in (self.capture, self.wall) if times is not None]
+        known = [part for part in parts if part is not None]
+        return sum(known) if known and len(known) == len(parts) else None
 
     def error(self, metric: str, judge: str = "method") -> float | None:
         """One metric, or None where it was not measured."""
