@@ -36,7 +36,7 @@ from .base import FrameShape, Plan, row_pitch
 
 __all__ = ["MAX_STEPS", "SIZE", "Pyramid", "SubImages", "blur_radius", "level_table", "matting_functions"]
 
-# Sigma 418 px.
+# Sigma 440 px.
 MAX_STEPS = 9
 
 # Constants of kernels/pyramid.cl.
@@ -367,12 +367,14 @@ class _Builder:
         flat, inv, slope, fill, fill_inv, blur = (
             f"{run}_{name}" for name in ("flat", "flat_inv", "slope", "fill", "fill_inv", "blur")
         )
+        if self.method.matting == "paper":
+            slope = inv
         stack = self.sources * self.frame_pixels
         steps = int(self.table[:, 0, 1].max())
         for name, nbytes in (
             (flat, stack * 16),
             (inv, stack * 4),
-            (slope, stack * 4),
+            *(((slope, stack * 4),) if slope != inv else ()),
             (fill, self.level_pixels * 16),
             (fill_inv, self.level_pixels * 4),
             (blur, self.level_pixels * 16 if steps else 16),
@@ -389,12 +391,13 @@ class _Builder:
             (self.items, rows),
             traffic=40 * self.sources * self.pixels,
         )
-        self._add(
-            "pyramid_slope",
-            (write(slope), read(inv), self.size),
-            (self.items, rows),
-            traffic=8 * self.sources * self.pixels,
-        )
+        if self.method.matting != "paper":  # else handed over, not read
+            self._add(
+                "pyramid_slope",
+                (write(slope), read(inv), self.size),
+                (self.items, rows),
+                traffic=8 * self.sources * self.pixels,
+            )
         updated = (read_write(fill), read_write(fill_inv), read("table"))
         self._add(
             "pyramid_cull",

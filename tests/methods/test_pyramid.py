@@ -13,6 +13,7 @@ from cldof.methods import FrameShape
 from cldof.methods.pyramid import MAX_STEPS, Pyramid, SubImages, blur_radius
 from cldof.renderer import _inverse_depth_program
 from tests.frames import noise_frame, plane_frame
+from tests.opengl import require_opengl
 from tests.oracles import pyramid as oracle
 from tests.running import run_program
 from tests.tolerances import assert_close
@@ -342,3 +343,29 @@ def test_an_enormous_aperture_is_planned_and_rendered(device: Device) -> None:
 def test_bad_options_are_refused(options: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Pyramid(**options)
+
+
+@pytest.mark.parametrize("name", ["row", "tabletop", "glass", "plane"])
+def test_scenes_are_close_to_their_reference(device: Device, name: str) -> None:
+    """At least 27 dB against a Gaussian lens; docs/methods/pyramid.md has the table at 512x512."""
+    require_opengl()
+    from cldof.capture.accumulate import accumulate
+    from cldof.capture.peel import DepthPeeler
+    from cldof.capture.scenes import builtin_scene
+
+    scene = builtin_scene(name)
+    camera = scene.camera_for(192, 192)
+    assert scene.aperture_radius_m is not None
+    assert scene.focus_distance_m is not None
+    lens = Lens(scene.aperture_radius_m, scene.focus_distance_m)
+    with DepthPeeler(192, 192) as peeler:
+        frame = peeler.peel(scene, camera, layers=4, lens=lens, guard_px=8)
+        reference = accumulate(peeler, scene, camera, lens, views=128, shape="gaussian")
+    expected = np.clip(reference.image[..., :3], 0, 1).astype(np.float64)
+    errors = [
+        (np.clip(image[..., :3], 0, 1) - expected) ** 2
+        for image in (render(device, frame, lens), frame.pinhole_image())
+    ]
+    reached, without = (-10.0 * math.log10(error.mean()) for error in errors)
+    assert reached >= 27.0
+    assert reached >= without + 4.0
