@@ -15,21 +15,26 @@ from .errors import (
     SceneError,
 )
 from .frame import LayeredFrame
-from .lens import Lens
+from .lens import Aperture, DiscAperture, GaussianAperture, ImageAperture, Lens, PolygonAperture
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Aperture",
     "BuildError",
     "Camera",
     "CaptureError",
     "CldofError",
     "DeviceError",
+    "DiscAperture",
     "FrameError",
+    "GaussianAperture",
+    "ImageAperture",
     "InputError",
     "LayeredFrame",
     "Lens",
     "OutputError",
+    "PolygonAperture",
     "Renderer",
     "SceneError",
     "__version__",
