@@ -5,7 +5,7 @@ and from the farthest one, layers are composed and blurred step by step towards 
 layer ``n`` steps from the focus is blurred by all ``n`` steps, in total ``sigma_n^2 = step_1^2 + ... + step_n^2`` with
 ``step_n = n * sigma_step`` (eqs. 14-15).
 
-``matting="paper"`` uses the published matting functions. The default differs in four things, each measured in
+``matting="paper"`` uses the published matting functions. The default differs in five things, each measured in
 docs/decisions.md; kernels/layered.cl says how.
 
 - Anchors stand at the CoC of their layer, not half-way to the next (eq. 9). Over the interval behind anchor k the
@@ -14,6 +14,8 @@ docs/decisions.md; kernels/layered.cl says how.
   focus stays untouched.
 - A surface enters the next layer early only where it slopes into it, as far as the blur opens a seam. Entering every
   layer a whole interval early widens silhouettes.
+- A surface takes full weight in its own layer where it is broad, a share where it is thin: coverage that blurs to
+  little must not be counted twice.
 - Hidden slots fall gently where no nearer surface would be covered.
 - Glass is shared out between two layers so that it lets through what its alpha says.
 
