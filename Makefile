@@ -12,7 +12,7 @@ export PYTHON
 help:
 	@echo "make demo   render a built-in scene to out/demo.png (and out/demo-pinhole.png beside it)"
 	@echo "make test   run all tests          (ARGS='-k lens' picks some)"
-	@echo "make bench  time every pass and the whole frame, as ratios to a device copy"
+	@echo "make bench  accuracy and time of every method (ARGS=--quick: 3 minutes; ARGS=speed: each pass)"
 	@echo "make lint   ruff check, ruff format --check, mypy"
 	@echo "make clean  remove .venv, out/ and caches"
 
@@ -28,7 +28,7 @@ test:
 
 bench:
 	@scripts/setup.sh bench
-	$(VENV)/python -m bench $(ARGS)
+	$(VENV)/python -m bench $(ARGS) $(if $(DEVICE),$(if $(filter speed,$(ARGS)),--device,--devices) "$(DEVICE)")
 
 lint:
 	@scripts/setup.sh dev

@@ -62,8 +62,25 @@ LADDERS: dict[str, tuple[Rung, ...]] = {
         Rung("paper's matting", {"matting": "paper"}),
         Rung("supersample 2", supersample=2, quick=True),
     ),
-    "pyramid": (Rung("default", peels=1, quick=True, shown=True),),
-    "gather": (Rung("default", peels=1, quick=True, shown=True),),
+    "pyramid": (
+        Rung("1 peel", peels=1, quick=True, shown=True),
+        Rung("4 peels", peels=4),
+        Rung("paper's matting", {"matting": "paper"}, peels=1),
+        Rung("paper's radius", {"radius": "paper"}, peels=1),
+    ),
+    "gather": (
+        Rung("16 samples", {"samples": 16}, peels=1),
+        Rung("64 samples", peels=1, quick=True, shown=True),
+        Rung("256 samples", {"samples": 256}, peels=1),
+    ),
+    "multiview": (
+        Rung("16 rays", {"rays": 16}),
+        Rung("64 rays", quick=True, shown=True),
+        Rung("256 rays", {"rays": 256}),
+        Rung("64 rays, 8 peels", peels=8),
+        Rung("64 rays, jitter", {"jitter": True}),
+        Rung("64 rays, no cones", {"cone": False}),
+    ),
 }
 
 
