@@ -8,6 +8,7 @@ from ..errors import InputError
 from .base import FrameShape, Method, Plan
 from .gather import Gather
 from .layered import Layered
+from .lightfield import LightField
 from .multiview import Multiview
 from .pyramid import Pyramid
 
@@ -17,6 +18,7 @@ __all__ = ["METHODS", "FrameShape", "Method", "Plan", "make_method"]
 METHODS: dict[str, type[Any]] = {
     "gather": Gather,
     "layered": Layered,
+    "lightfield": LightField,
     "multiview": Multiview,
     "pyramid": Pyramid,
 }

@@ -1,0 +1,844 @@
+/* lightfield.cl: the light-field method (Yu, Wang & Yu 2010).
+ *
+ * A point of the lens, v in units of its radius, sees a surface of signed CoC radius C px (negative nearer than focus)
+ * v * C px from where the reference view sees it, if its frustum is sheared so that the plane in focus stays where it
+ * is. That is eq. 4 with the focal disparity of eq. 7 taken off already, so views add up pixel by pixel:
+ *
+ *   lightfield_tiles, lightfield_cull   which parts of the layers no view can see
+ *   lightfield_slots       what is left to warp, and how far each slot reaches; once a frame
+ *   lightfield_views       the nearest slot of every pixel of a view: one work-item a view, no atomics (CPUs)
+ *   lightfield_clear, lightfield_depths, lightfield_sources     the same bits by atomic minimum (GPUs)
+ *   lightfield_shrink      Gaussian pyramid of the layers
+ *   lightfield_synthesize  wide-aperture sum over the views, colour looked up in the reference view
+ *
+ * Positions are whole numbers of 1/256 px. A product of two floats is rounded in the same way everywhere and then
+ * truncated; only integers are added. So every device puts every slot into the same pixels.
+ *
+ * A winner is two words per pixel, view and plane: the source slot (low) and the order of its inverse depth (high).
+ * As one 64-bit number the smallest is the nearest slot and, of equally near ones, the first in memory. NONE is a hole.
+ * Plane 0 holds slots that hide what is behind them; planes 1.. hold glass, by how much glass its column has in front
+ * of it. */
+
+#include "common.clh"
+
+/* How a slot's support is widened: 0 the nearest pixel, 1 the 2x2 or 2 the 3x3 around it (section 3.2), 3 as far as its
+ * surface goes: half-way to neighbours of the same surface, and the pixel's own half where the surface ends. */
+#ifndef LIGHTFIELD_SUPPORT
+#define LIGHTFIELD_SUPPORT 3
+#endif
+/* 1: some slots are glass, and there are planes beside the first. */
+#ifndef LIGHTFIELD_GLASS
+#define LIGHTFIELD_GLASS 0
+#endif
+/* How a ray finds its colour: 0 that of the winner, 1 bilinear between the pixels of its surface, 2 a random pixel of
+ * the surface within the ray's share of the lens. */
+#ifndef LIGHTFIELD_LOOKUP
+#define LIGHTFIELD_LOOKUP 1
+#endif
+/* Levels of the pyramid above the layers; 0: rays of any width see the layers themselves. */
+#ifndef LIGHTFIELD_LEVELS
+#define LIGHTFIELD_LEVELS 0
+#endif
+/* 1: 64-bit atomic minimum. */
+#ifndef LIGHTFIELD_PACKED
+#define LIGHTFIELD_PACKED 0
+#endif
+
+#define NONE 0xffffffffu
+#define SUB 256.0f           /* positions per pixel */
+#define EDGE_NONE (-128)     /* no neighbour of the same surface on this side */
+#define EDGE_STEPS 16.0f     /* an edge is the difference of CoC to the neighbour, in 1/16 px */
+#define EDGE_OVERLAP 8       /* 1/256 px: neighbours overlap by this much, so that rounding leaves no seam */
+#define SAME_SURFACE_PX 1.0f /* neighbours whose CoC differ by no more are one surface: a gap of at most a pixel */
+#define STEEP_PX 7.5f        /* at the most, for neighbours whose CoC go on in a straight line */
+#define STRAIGHT 0.25f       /* second difference over first, below which a line is straight */
+#define SIMILAR_PX 0.5f      /* colours are interpolated between CoC that differ by no more than this much ... */
+#define SIMILAR_SHARE 0.125f /* ... and this share of the CoC */
+#define OPAQUE_ALPHA 0.999f  /* as cldof.frame has it: less is glass */
+#define MAX_COC_PX 1048576.0f
+#define TILE 8               /* pixels each way, for culling */
+#define CULL_RINGS 6         /* tiles round a tile that may hide it: CoC up to 45 px apart */
+#define SEGMENT 32           /* pixels of a row that one item of lightfield_synthesize makes */
+#define MIN_WEIGHT 1e-4f     /* of all views together: less is a pixel that no view sees */
+#define LANES ((int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#define MAX_PLANES 4         /* plane 0 and three of glass */
+
+typedef struct {
+    int width, height, pitch, peels;            /* of the layers, guard band included */
+    int out_width, out_height, out_pitch, guard; /* of the views */
+    int planes;
+    int tiles_x, tiles_y;                       /* of the layers */
+} LightfieldSize;
+
+/* A view: v.x, v.y its point on the lens, y down; v.z, v.w where in its pixels it takes samples, whole 1/256 px around
+ * the middle. Varied from view to view this makes a silhouette that moves by part of a pixel cover its part. */
+typedef float4 LightfieldView;
+
+typedef struct {
+    float c1, c0; /* C = c1 * w + c0 in px */
+    float cos4;   /* (aperture radius / focal length)^2; 0 leaves the attenuation out */
+    float cell;   /* a ray's share of the CoC is 2 * |C| * cell px wide, and mip level log2(|C| * cell) shows it */
+    int reach;    /* px: no slot moves farther than this */
+} LightfieldLens;
+
+static inline float absolute(float v) { return v < 0.0f ? -v : v; }
+
+/* An order that grows with w for every float, turned round: the nearest slot has the smallest key. */
+static inline uint depth_key(float w)
+{
+    uint bits = as_uint(w);
+    return bits & 0x80000000u ? bits : ~(bits | 0x80000000u);
+}
+
+static inline float key_depth(uint key) { return as_float(~key & 0x7fffffffu); } /* of w >= 0 */
+
+static inline float coc_of(float w, LightfieldLens lens)
+{
+    float c = lens.c1 * w + lens.c0;
+    c = c < -MAX_COC_PX ? -MAX_COC_PX : c;
+    return c > MAX_COC_PX ? MAX_COC_PX : c;
+}
+
+/* Difference of CoC to the neighbour (dx, dy) of a slot if both belong to one surface, else MAXFLOAT. */
+static inline float edge_of(const __global float *inv_depth, LightfieldSize size, LightfieldLens lens, int m, int x,
+                            int y, int dx, int dy, float c)
+{
+    const int nx = x + dx, ny = y + dy;
+    if (nx < 0 || nx >= size.width || ny < 0 || ny >= size.height) return MAXFLOAT;
+    const size_t plane = (size_t)size.height * size.pitch;
+    const __global float *there = inv_depth + (size_t)ny * size.pitch + nx;
+    const float w = there[m * plane];
+    float d = MAXFLOAT;
+    if (w >= 0.0f) {
+        d = coc_of(w, lens) - c;
+        if (absolute(d) <= SAME_SURFACE_PX) return d;
+    }
+    /* Beside a silhouette in front of it a surface goes on in another peel. */
+    for (int other = m - 1; other <= m + 1; other += 2) {
+        if (other < 0 || other >= size.peels) continue;
+        float v = there[other * plane];
+        float e = coc_of(v, lens) - c;
+        if (v >= 0.0f && absolute(e) <= SAME_SURFACE_PX) return e;
+    }
+    if (absolute(d) > STEEP_PX) return MAXFLOAT;
+    const int ax = nx + dx, ay = ny + dy, bx = x - dx, by = y - dy;
+    if (ax >= 0 && ax < size.width && ay >= 0 && ay < size.height) {
+        float v = inv_depth[m * plane + (size_t)ay * size.pitch + ax];
+        if (v >= 0.0f && absolute(coc_of(v, lens) - c - 2.0f * d) <= STRAIGHT * absolute(d)) return d;
+    }
+    if (bx >= 0 && bx < size.width && by >= 0 && by < size.height) {
+        float v = inv_depth[m * plane + (size_t)by * size.pitch + bx];
+        if (v >= 0.0f && absolute(coc_of(v, lens) - c + d) <= STRAIGHT * absolute(d)) return d;
+    }
+    return MAXFLOAT;
+}
+
+static inline uint edge_code(float d)
+{
+    if (d == MAXFLOAT) return (uint)EDGE_NONE & 255u;
+    int q = (int)(d * EDGE_STEPS + (d < 0.0f ? -0.5f : 0.5f));
+    return (uint)q & 255u;
+}
+
+static inline int is_glass(const __global float *color, LightfieldSize size, int m, int x, int y)
+{
+    const float a = color[(((size_t)m * size.height + y) * size.width + x) * 4 + 3];
+    return a > 0.0f && a < OPAQUE_ALPHA;
+}
+
+/* Sixteen inverse depths of a row from x on (a multiple of 16), and those one pixel to the left and right. */
+static inline float16 depths_at(const __global float *inv_depth, LightfieldSize size, int m, int x, int y)
+{
+    if (y < 0 || y >= size.height) return (float16)(EMPTY);
+    return load_quad(inv_depth + ((size_t)m * size.height + y) * size.pitch + x);
+}
+
+static inline float16 depths_left(const __global float *inv_depth, LightfieldSize size, int m, int x, int y, float16 w)
+{
+    const float edge = x > 0 ? inv_depth[((size_t)m * size.height + y) * size.pitch + x - 1] : EMPTY;
+    return (float16)(edge, w.s0123, w.s456, w.s789a, w.sbcd, w.se);
+}
+
+static inline float16 depths_right(const __global float *inv_depth, LightfieldSize size, int m, int x, int y, float16 w)
+{
+    const float edge = x + 16 < size.pitch && y >= 0 && y < size.height
+                           ? inv_depth[((size_t)m * size.height + y) * size.pitch + x + 16] : EMPTY;
+    return (float16)(w.s1234, w.s567, w.s89ab, w.scdef, edge);
+}
+
+static inline float16 coc16(float16 w, LightfieldLens lens)
+{
+    float16 c = lens.c1 * w + lens.c0;
+    c = c < -MAX_COC_PX ? (float16)(-MAX_COC_PX) : c;
+    return c > MAX_COC_PX ? (float16)(MAX_COC_PX) : c;
+}
+
+static inline float16 absolute16(float16 v) { return v < 0.0f ? -v : v; }
+
+static inline int all16(int16 v)
+{
+    const int8 a = v.lo & v.hi;
+    const int4 b = a.lo & a.hi;
+    return b.x & b.y & b.z & b.w;
+}
+
+/* lightfield_tiles: range of the inverse depth of each tile, and whether the first peel is one surface there.
+ * reads   inv_depth  float[peels][height][pitch]     1/m
+ *         color      float[peels][height][width][4]  alpha, with LIGHTFIELD_GLASS
+ * writes  tiles  float2[peels][tiles_y][tiles_x]  (smallest, largest); of the first peel (-1, -1) where it has edges,
+ *                                                 holes or glass; (0, -1) where a peel is empty
+ * range   2-D, one item per tile of a peel: (tiles_x, peels * tiles_y), any local size */
+__kernel void lightfield_tiles(__global float2 *restrict tiles, const __global float *restrict inv_depth,
+                               const __global float *restrict color, LightfieldSize size, LightfieldLens lens)
+{
+    const int tx = get_global_id(0), line = get_global_id(1);
+    if (tx >= size.tiles_x || line >= size.peels * size.tiles_y) return;
+    const int m = line / size.tiles_y, x0 = tx * TILE, y0 = line % size.tiles_y * TILE;
+    const int x1 = x0 + TILE < size.width ? x0 + TILE : size.width, y1 = y0 + TILE < size.height ? y0 + TILE : size.height;
+    const __global float *peel = inv_depth + (size_t)m * size.height * size.pitch;
+    const float same = SAME_SURFACE_PX / (absolute(lens.c1) + 1e-30f);
+    float low = MAXFLOAT, high = EMPTY;
+    int is_open = 0;
+    for (int y = y0; y < y1; y++)
+        for (int x = x0; x < x1; x++) {
+            const __global float *at = peel + (size_t)y * size.pitch + x;
+            const float w = *at;
+            if (w >= 0.0f) {
+                low = w < low ? w : low;
+                high = w > high ? w : high;
+            }
+            if (m == 0) {
+                is_open |= w < 0.0f;
+                if (x + 1 < size.width) is_open |= absolute(at[1] - w) > same;
+                if (y + 1 < size.height) is_open |= absolute(at[size.pitch] - w) > same;
+#if LIGHTFIELD_GLASS
+                is_open |= is_glass(color, size, 0, x, y);
+#endif
+            }
+        }
+    tiles[line * size.tiles_x + tx] = is_open ? (float2)(EMPTY) : high < 0.0f ? (float2)(0.0f, EMPTY) : (float2)(low, high);
+}
+
+/* lightfield_cull: tiles that the first peel hides from all of the lens.
+ * A nearer surface without edges hides what is behind it as far as it moves against it: over a distance that it itself
+ * spans in every direction.
+ * reads   tiles      float2[peels][tiles_y][tiles_x]
+ * writes  tile_open  uchar[peels][tiles_y][tiles_x]  0: no view can see the peel there
+ * range   2-D, one item per tile of a peel: (tiles_x, peels * tiles_y), any local size */
+__kernel void lightfield_cull(__global uchar *restrict tile_open, const __global float2 *restrict tiles,
+                              LightfieldSize size, LightfieldLens lens)
+{
+    const int tx = get_global_id(0), line = get_global_id(1);
+    if (tx >= size.tiles_x || line >= size.peels * size.tiles_y) return;
+    const float2 own = tiles[line * size.tiles_x + tx];
+    const int ty = line % size.tiles_y;
+    int is_hidden = line >= size.tiles_y && own.y < 0.0f;
+    float2 front = (float2)(MAXFLOAT, EMPTY);
+    for (int ring = 0; line >= size.tiles_y && ring <= CULL_RINGS && !is_hidden; ring++) {
+        int is_closed = tx >= ring && ty >= ring && tx + ring < size.tiles_x && ty + ring < size.tiles_y;
+        for (int j = -ring; j <= ring && is_closed; j++)
+            for (int i = -ring; i <= ring && is_closed; i += j == -ring || j == ring ? 1 : 2 * ring) {
+                const float2 other = tiles[(ty + j) * size.tiles_x + tx + i];
+                is_closed = other.y >= 0.0f && other.x > own.y;
+                front.x = other.x < front.x ? other.x : front.x;
+                front.y = other.y > front.y ? other.y : front.y;
+            }
+        if (!is_closed) break;
+        /* 3 px for the reach of footprints. */
+        is_hidden = absolute(lens.c1) * (front.y - own.x) + 3.0f <= (float)(ring * TILE);
+    }
+    tile_open[line * size.tiles_x + tx] = !is_hidden;
+}
+
+static inline int16 edge_code16(float16 d)
+{
+    return convert_int16(d * EDGE_STEPS + (d < 0.0f ? (float16)(-0.5f) : (float16)(0.5f)));
+}
+
+/* lightfield_slots: the slots of a row of a peel that any view can see, packed to the front.
+ * reads   inv_depth  float[peels][height][pitch]     1/m
+ *         color      float[peels][height][width][4]  alpha, with LIGHTFIELD_GLASS
+ *         tile_open  uchar[peels][tiles_y][tiles_x]
+ * writes  slot_at    uint[peels][height][pitch]   where in inv_depth the slot stands
+ *         slot_key   uint[peels][height][pitch]   depth_key
+ *         slot_coc   float[peels][height][pitch]  CoC in 1/256 px
+ *         slot_edge  uint[peels][height][pitch]   4 x int8: CoC to the left, right, upper, lower neighbour; edge_code
+ *         slot_plane uchar[peels][height][pitch]  with LIGHTFIELD_GLASS
+ *         slot_count int[peels][height]
+ *         cells      uchar[peels][height][pitch]  1: the pixel and those right, below and both are one surface
+ * range   1-D, one item per row of a peel, any local size */
+__kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *restrict slot_key,
+                               __global float *restrict slot_coc, __global uint *restrict slot_edge,
+                               __global uchar *restrict slot_plane, __global int *restrict slot_count,
+                               __global uchar *restrict cells, const __global float *restrict inv_depth,
+                               const __global float *restrict color, const __global uchar *restrict tile_open,
+                               LightfieldSize size, LightfieldLens lens)
+{
+    const int line = get_global_id(0);
+    if (line >= size.peels * size.height) return;
+    const int m = line / size.height, y = line % size.height;
+    const size_t row = (size_t)line * size.pitch, peel = (size_t)size.height * size.pitch;
+    const __global uchar *open = tile_open + (m * size.tiles_y + y / TILE) * size.tiles_x;
+    int count = 0;
+    for (int x0 = 0; x0 < size.pitch; x0 += 16) {
+        int is_open = 0;
+        for (int t = x0 / TILE; t < x0 / TILE + 16 / TILE && t < size.tiles_x; t++) is_open |= open[t];
+        if (!is_open) continue; /* nor will any ray ask for these cells */
+        const float16 w = depths_at(inv_depth, size, m, x0, y), c = coc16(w, lens);
+        const float16 below = depths_at(inv_depth, size, m, x0, y + 1), above = depths_at(inv_depth, size, m, x0, y - 1);
+        const float16 left = depths_left(inv_depth, size, m, x0, y, w), right = depths_right(inv_depth, size, m, x0, y, w);
+        const float16 diagonal = depths_right(inv_depth, size, m, x0, y + 1, below);
+        const float16 c_right = coc16(right, lens), c_below = coc16(below, lens);
+        const float16 d_left = coc16(left, lens) - c, d_right = c_right - c;
+        const float16 d_above = coc16(above, lens) - c, d_below = c_below - c;
+        const int16 is_here = w >= 0.0f;
+        const float16 similar = SIMILAR_PX + SIMILAR_SHARE * absolute16(c);
+        const int16 is_cell = is_here & (right >= 0.0f) & (below >= 0.0f) & (diagonal >= 0.0f)
+                              & (absolute16(d_right) <= similar) & (absolute16(d_below) <= similar)
+                              & (absolute16(coc16(diagonal, lens) - c) <= similar);
+        for (int i = 0; i < 16; i++) cells[row + x0 + i] = ((const int *)&is_cell)[i] ? 1 : 0;
+        const int16 is_plain = is_here & (left >= 0.0f) & (right >= 0.0f) & (above >= 0.0f) & (below >= 0.0f)
+                               & (absolute16(d_left) <= SAME_SURFACE_PX) & (absolute16(d_right) <= SAME_SURFACE_PX)
+                               & (absolute16(d_above) <= SAME_SURFACE_PX) & (absolute16(d_below) <= SAME_SURFACE_PX);
+        const int16 edges = (edge_code16(d_left) & 255) | (edge_code16(d_right) & 255) << 8
+                            | (edge_code16(d_above) & 255) << 16 | edge_code16(d_below) << 24;
+        for (int i = 0; i < 16 && x0 + i < size.width; i++) {
+            const int x = x0 + i;
+            const float depth = ((const float *)&w)[i];
+            if (depth < 0.0f || !open[x / TILE]) continue;
+            /* The void behind a surface is the same for every peel. */
+            if (m > 0 && depth == 0.0f && inv_depth[row - peel + x] == 0.0f) continue;
+            const float coc = ((const float *)&c)[i];
+            const size_t to = row + count++;
+            slot_at[to] = (uint)(row + x);
+            slot_key[to] = depth_key(depth);
+            slot_coc[to] = coc * SUB;
+            uint edge = ((const uint *)&edges)[i];
+#if LIGHTFIELD_SUPPORT == 3
+            if (!((const int *)&is_plain)[i])
+                edge = edge_code(edge_of(inv_depth, size, lens, m, x, y, -1, 0, coc))
+                     | edge_code(edge_of(inv_depth, size, lens, m, x, y, 1, 0, coc)) << 8
+                     | edge_code(edge_of(inv_depth, size, lens, m, x, y, 0, -1, coc)) << 16
+                     | edge_code(edge_of(inv_depth, size, lens, m, x, y, 0, 1, coc)) << 24;
+#endif
+            slot_edge[to] = edge;
+#if LIGHTFIELD_GLASS
+            int plane = 0;
+            if (is_glass(color, size, m, x, y)) {
+                for (int k = 0; k <= m; k++) plane += is_glass(color, size, k, x, y);
+                plane = plane < size.planes ? plane : size.planes - 1;
+            }
+            slot_plane[to] = (uchar)plane;
+#endif
+        }
+    }
+    slot_count[line] = count;
+}
+
+/* Pixels [first, end) of a view's row or column that a slot covers; position in 1/256 px. */
+#define SPAN(INT, first, end, at, low, high)                                                                          \
+    INT first, end;                                                                                                   \
+    if (LIGHTFIELD_SUPPORT == 0) {                                                                                    \
+        first = ((at) + 128) >> 8;                                                                                    \
+        end = first + 1;                                                                                              \
+    } else if (LIGHTFIELD_SUPPORT == 1) {                                                                             \
+        first = (at) >> 8;                                                                                            \
+        end = ((at) + 511) >> 8;                                                                                      \
+    } else if (LIGHTFIELD_SUPPORT == 2) {                                                                             \
+        first = ((at) - 128) >> 8;                                                                                    \
+        end = first + 3;                                                                                              \
+    } else {                                                                                                          \
+        first = ((at) + 127 - (low)) >> 8;                                                                            \
+        end = ((at) + 383 + (high)) >> 8;                                                                             \
+    }
+
+
+/* How far an edge lies beyond the pixel's own half: it goes half-way to the neighbour, v * d / 2 = v * q * 8. */
+#define EDGE_REACH(q, moved, shear) ((q) == EDGE_NONE ? 0 : (moved) + (shear) + EDGE_OVERLAP)
+#define EDGE_BYTE(edge, shift) ((edge) << (24 - (shift)) >> 24)
+#define KNOWN_EDGE(q) ((q) == EDGE_NONE ? 0 : (q) < 0 ? -(q) : (q))
+#define LARGER(a, b) ((a) > (b) ? (a) : (b))
+
+/* Pixels of the view that slots cover: columns x0 to before x1, rows y0 to before y1. Rows and columns of a slope shear
+ * against each other; the widest edge across covers what opens between them. INT is int or int16. */
+#define FOOTPRINT(INT, TO_INT, TO_FLOAT, column, line_y, coc, edge, v)                                                          \
+    const INT at_x = ((column) << 8) + TO_INT((coc) * (v).x) + (int)(v).z, at_y = ((line_y) << 8) + TO_INT((coc) * (v).y) + (int)(v).w;                   \
+    const INT l = EDGE_BYTE(edge, 0), r = EDGE_BYTE(edge, 8), u = EDGE_BYTE(edge, 16), d = EDGE_BYTE(edge, 24);       \
+    const float slope_x = 8.0f * (v).x, slope_y = 8.0f * (v).y;                                                       \
+    const INT shear_x = TO_INT(TO_FLOAT(LARGER(KNOWN_EDGE(u), KNOWN_EDGE(d))) * absolute(slope_x));                   \
+    const INT shear_y = TO_INT(TO_FLOAT(LARGER(KNOWN_EDGE(l), KNOWN_EDGE(r))) * absolute(slope_y));                   \
+    SPAN(INT, x0, x1, at_x, EDGE_REACH(l, -TO_INT(TO_FLOAT(l) * slope_x), shear_x),                                   \
+         EDGE_REACH(r, TO_INT(TO_FLOAT(r) * slope_x), shear_x))                                                       \
+    SPAN(INT, y0, y1, at_y, EDGE_REACH(u, -TO_INT(TO_FLOAT(u) * slope_y), shear_y),                                   \
+         EDGE_REACH(d, TO_INT(TO_FLOAT(d) * slope_y), shear_y))
+
+static inline int16 load_ints(const __global uint *p) { return as_int16(load_quad((const __global float *)p)); }
+
+/* lightfield_views: the nearest slot of every pixel of a view. The form for CPUs.
+ * source  Yu, Wang & Yu 2010, section 3.2, eq. 4
+ * reads   slot_*   see lightfield_slots
+ *         views    float4[]  see LightfieldView
+ * writes  winners  ulong[views][planes][out_height][out_pitch]  columns from out_width on are left alone
+ * range   2-D, one item per view and band of band_rows rows, any local size */
+__kernel void lightfield_views(__global ulong *restrict winners, const __global uint *restrict slot_at,
+                               const __global uint *restrict slot_key, const __global float *restrict slot_coc,
+                               const __global uint *restrict slot_edge, const __global uchar *restrict slot_plane,
+                               const __global int *restrict slot_count, const __global LightfieldView *restrict views,
+                               LightfieldSize size, LightfieldLens lens, int first_view, int band_rows)
+{
+    const int view = get_global_id(0);
+    const int top = (int)get_global_id(1) * band_rows;
+    if (top >= size.out_height) return;
+    const int bottom = top + band_rows < size.out_height ? top + band_rows : size.out_height;
+    const LightfieldView v = views[first_view + view];
+    const size_t plane_size = (size_t)size.out_height * size.out_pitch;
+    __global ulong *own = winners + (size_t)view * size.planes * plane_size;
+
+    for (int p = 0; p < size.planes; p++)
+        for (int y = top; y < bottom; y++)
+            for (int x = 0; x < size.out_width; x++) own[p * plane_size + (size_t)y * size.out_pitch + x] = ~0ul;
+
+    const int first_row = top + size.guard - lens.reach, end_row = bottom + size.guard + lens.reach;
+    for (int y = first_row < 0 ? 0 : first_row; y < end_row && y < size.height; y++) {
+        for (int m = 0; m < size.peels; m++) {
+            const int line = m * size.height + y;
+            const int count = slot_count[line];
+            const size_t row = (size_t)line * size.pitch;
+            for (int b = 0; b < count; b += 16) {
+                const int16 at = load_ints(slot_at + row + b), edge = load_ints(slot_edge + row + b);
+                const float16 coc = load_quad(slot_coc + row + b);
+                FOOTPRINT(int16, convert_int16, convert_float16, at - (int)row - size.guard, (int16)(y - size.guard), coc,
+                          edge, v)
+                const int16 lefts = LARGER(x0, 0), rights = x1 < size.out_width ? x1 : size.out_width;
+                const int16 uppers = LARGER(y0, top), lowers = y1 < bottom ? y1 : bottom;
+                const int16 is_pixel = (rights - lefts == 1) & (lowers - uppers == 1);
+                const int16 pixels = uppers * size.out_pitch + lefts;
+                const int n = count - b < 16 ? count - b : 16;
+                for (int i = 0; i < n; i++) {
+                    const ulong key = (ulong)slot_key[row + b + i] << 32 | slot_at[row + b + i];
+#if LIGHTFIELD_GLASS
+                    __global ulong *plane = own + slot_plane[row + b + i] * plane_size;
+#else
+                    __global ulong *plane = own;
+#endif
+                    if (((const int *)&is_pixel)[i]) {
+                        __global ulong *to = plane + ((const int *)&pixels)[i];
+                        const ulong old = *to;
+                        *to = key < old ? key : old;
+                        continue;
+                    }
+                    for (int j = ((const int *)&uppers)[i]; j < ((const int *)&lowers)[i]; j++)
+                        for (int k = ((const int *)&lefts)[i]; k < ((const int *)&rights)[i]; k++) {
+                            __global ulong *to = plane + (size_t)j * size.out_pitch + k;
+                            if (key < *to) *to = key;
+                        }
+                }
+            }
+        }
+    }
+}
+
+/* The same in three steps for devices with many threads. `slot` and `view` say whose turn it is. */
+#define FOR_PIXELS_OF_SLOT                                                                                            \
+    const int view = get_global_id(1), line = (int)get_global_id(0) / size.pitch;                                     \
+    if (line >= size.peels * size.height) return;                                                                     \
+    const int slot = (int)get_global_id(0) % size.pitch;                                                              \
+    if (slot >= slot_count[line]) return;                                                                             \
+    const size_t row = (size_t)line * size.pitch;                                                                     \
+    const LightfieldView v = views[first_view + view];                                                                        \
+    const uint at = slot_at[row + slot], key = slot_key[row + slot];                                                  \
+    const int edges = (int)slot_edge[row + slot];                                                                     \
+    const int plane = LIGHTFIELD_GLASS ? slot_plane[row + slot] : 0;                                                  \
+    __global uint *own = winners + ((size_t)view * size.planes + plane) * size.out_height * size.out_pitch * 2;       \
+    FOOTPRINT(int, (int), (float), (int)(at - row) - size.guard, line % size.height - size.guard,                     \
+              slot_coc[row + slot], edges, v)                                                                         \
+    for (int j = LARGER(y0, 0); j < y1 && j < size.out_height; j++)                                                   \
+        for (int k = LARGER(x0, 0); k < x1 && k < size.out_width; k++)
+
+/* lightfield_clear: holes everywhere.
+ * writes  winners  uint2[views][planes][out_height][out_pitch]  low word first
+ * range   1-D, one item per word, any local size */
+__kernel void lightfield_clear(__global uint *restrict winners, uint words)
+{
+    if (get_global_id(0) < words) winners[get_global_id(0)] = NONE;
+}
+
+/* lightfield_depths: the nearest depth of every pixel of every view.
+ * source  Yu, Wang & Yu 2010, section 3.2
+ * reads   slot_*, views  see lightfield_views
+ * updates winners  the high words
+ * range   2-D, (peels * height * pitch, views), any local size */
+__kernel void lightfield_depths(__global uint *restrict winners, const __global uint *restrict slot_at,
+                                const __global uint *restrict slot_key, const __global float *restrict slot_coc,
+                                const __global uint *restrict slot_edge, const __global uchar *restrict slot_plane,
+                                const __global int *restrict slot_count, const __global LightfieldView *restrict views,
+                                LightfieldSize size, int first_view)
+{
+    FOR_PIXELS_OF_SLOT atomic_min(own + ((size_t)j * size.out_pitch + k) * 2 + 1, key);
+}
+
+/* lightfield_sources: of the slots that are nearest, the first in memory.
+ * reads   slot_*, views  see lightfield_views
+ * updates winners  the low words, from the high ones
+ * range   2-D, (peels * height * pitch, views), any local size */
+__kernel void lightfield_sources(__global uint *restrict winners, const __global uint *restrict slot_at,
+                                 const __global uint *restrict slot_key, const __global float *restrict slot_coc,
+                                 const __global uint *restrict slot_edge, const __global uchar *restrict slot_plane,
+                                 const __global int *restrict slot_count, const __global LightfieldView *restrict views,
+                                 LightfieldSize size, int first_view)
+{
+    FOR_PIXELS_OF_SLOT
+    {
+        __global uint *to = own + ((size_t)j * size.out_pitch + k) * 2;
+        if (to[1] == key) atomic_min(to, at);
+    }
+}
+
+#if LIGHTFIELD_PACKED
+#pragma OPENCL EXTENSION cl_khr_int64_extended_atomics : enable
+/* lightfield_packed: both steps in one, by 64-bit atomics.
+ * reads   slot_*, views  see lightfield_views
+ * updates winners
+ * range   2-D, (peels * height * pitch, views), any local size */
+__kernel void lightfield_packed(__global uint *restrict winners, const __global uint *restrict slot_at,
+                                const __global uint *restrict slot_key, const __global float *restrict slot_coc,
+                                const __global uint *restrict slot_edge, const __global uchar *restrict slot_plane,
+                                const __global int *restrict slot_count, const __global LightfieldView *restrict views,
+                                LightfieldSize size, int first_view)
+{
+    FOR_PIXELS_OF_SLOT
+        atom_min((volatile __global ulong *)own + (size_t)j * size.out_pitch + k, (ulong)key << 32 | at);
+}
+#endif
+
+/* Whether two inverse depths are near enough for their colours to be mixed; c is the CoC of w. */
+static inline int is_similar(float other, float w, float c, LightfieldLens lens)
+{
+    return other >= 0.0f && absolute(lens.c1) * absolute(other - w) <= SIMILAR_PX + SIMILAR_SHARE * absolute(c);
+}
+
+/* Glass and what is not are never mixed: an opaque surface would let light through. */
+static inline int is_same_kind(float4 a, float4 b)
+{
+    return !LIGHTFIELD_GLASS || (a.w >= OPAQUE_ALPHA) == (b.w >= OPAQUE_ALPHA);
+}
+
+/* Colour of a ray between pixels that may belong to several surfaces: bilinear, with those of another surface replaced
+ * by ones that are not. (ray_x, ray_y) in 1/256 px is where it meets the reference view, (x, y) the winner there. */
+static inline float4 edge_color(const __global float *color, const __global float *inv_depth, LightfieldSize size,
+                                LightfieldLens lens, int m, int x, int y, int ray_x, int ray_y, float w, float c)
+{
+    const __global float *own = color + (((size_t)m * size.height + y) * size.width + x) * 4;
+    const __global float *depth = inv_depth + ((size_t)m * size.height + y) * size.pitch + x;
+    const int step_x = ray_x < x << 8 ? -1 : 1, step_y = ray_y < y << 8 ? -1 : 1;
+    const int dx = step_x * (ray_x - (x << 8)), dy = step_y * (ray_y - (y << 8));
+    const int in_x = x + step_x >= 0 && x + step_x < size.width, in_y = y + step_y >= 0 && y + step_y < size.height;
+    const float4 base = load_pixel(own);
+    const long row = (long)step_y * size.width * 4;
+    const int has_x = in_x && is_similar(depth[step_x], w, c, lens);
+    const int has_y = in_y && is_similar(depth[step_y * size.pitch], w, c, lens);
+    const int has_both = in_x && in_y && is_similar(depth[step_y * size.pitch + step_x], w, c, lens);
+    float4 beside = has_x ? load_pixel(own + step_x * 4) : base;
+    float4 next = has_y ? load_pixel(own + row) : base;
+    beside = is_same_kind(beside, base) ? beside : base;
+    next = is_same_kind(next, base) ? next : base;
+    float4 across = has_both ? load_pixel(own + row + step_x * 4) : has_y ? next : beside;
+    across = is_same_kind(across, base) ? across : base;
+    const float fx = (float)(dx < 256 ? dx : 256) * (1.0f / SUB), fy = (float)(dy < 256 ? dy : 256) * (1.0f / SUB);
+    const float4 one = base + fx * (beside - base), two = next + fx * (across - next);
+    return one + fy * (two - one);
+}
+
+/* Colour of a random pixel of the winner's surface in the ray's share of the lens. */
+static inline float4 jittered_color(const __global float *color, const __global float *inv_depth, LightfieldSize size,
+                                    LightfieldLens lens, int m, int x, int y, int ray_x, int ray_y, float w, float c,
+                                    uint seed)
+{
+    const float4 base = load_pixel(color + (((size_t)m * size.height + y) * size.width + x) * 4);
+    const float width = 2.0f * absolute(c) * lens.cell;
+    seed = (seed ^ seed >> 16) * 0x7feb352du;
+    seed = (seed ^ seed >> 15) * 0x846ca68bu;
+    seed ^= seed >> 16;
+    const float dx = ((float)(seed & 0xffffu) * (1.0f / 65535.0f) - 0.5f) * width;
+    const float dy = ((float)(seed >> 16) * (1.0f / 65535.0f) - 0.5f) * width;
+    const int jx = (ray_x + (int)(dx * SUB) + 128) >> 8, jy = (ray_y + (int)(dy * SUB) + 128) >> 8;
+    if (jx >= 0 && jx < size.width && jy >= 0 && jy < size.height
+        && is_similar(inv_depth[((size_t)m * size.height + jy) * size.pitch + jx], w, c, lens)) {
+        const float4 found = load_pixel(color + (((size_t)m * size.height + jy) * size.width + jx) * 4);
+        if (is_same_kind(found, base)) return found;
+    }
+    return base;
+}
+
+#if LIGHTFIELD_LEVELS
+typedef struct {
+    int width[LIGHTFIELD_LEVELS], height[LIGHTFIELD_LEVELS], first[LIGHTFIELD_LEVELS]; /* pixels; of level 1 and up */
+} LightfieldMips;
+
+/* Colour from the pyramid, bilinear between what is of the winner's surface; .w of the result is -1 if nothing is. */
+static inline float4 mip_color(const __global float *mips, const __global float *mip_depths, LightfieldMips sizes,
+                               LightfieldLens lens, int level, int m, int ray_x, int ray_y, float w, float c,
+                               float4 base)
+{
+    const int width = sizes.width[level - 1], height = sizes.height[level - 1];
+    const size_t first = sizes.first[level - 1] + (size_t)m * width * height;
+    const float scale = 1.0f / (SUB * (float)(1 << level));
+    const float x = (float)ray_x * scale, y = (float)ray_y * scale; /* texel i stands on pixel i * 2^level */
+    const int x0 = (int)(x < 0.0f ? 0.0f : x), y0 = (int)(y < 0.0f ? 0.0f : y);
+    const float fx = x - (float)x0, fy = y - (float)y0;
+    float4 sum = (float4)(0.0f);
+    float weights = 0.0f;
+    for (int j = 0; j < 2; j++)
+        for (int i = 0; i < 2; i++) {
+            const size_t at = first + (size_t)clamp_index(y0 + j, height - 1) * width + clamp_index(x0 + i, width - 1);
+            const float weight = (i ? fx : 1.0f - fx) * (j ? fy : 1.0f - fy);
+            if (!(weight > 0.0f) || !is_similar(mip_depths[at], w, c, lens)) continue;
+            const float4 texel = load_pixel(mips + at * 4);
+            if (!is_same_kind(texel, base)) continue;
+            sum += weight * texel;
+            weights += weight;
+        }
+    return weights > 0.0625f ? sum * (1.0f / weights) : (float4)(-1.0f);
+}
+#endif
+
+/* One texel of a level from the one below, which is twice as fine. */
+static inline void shrink(__global float *to_color, __global float *to_depth, const __global float *color,
+                          const __global float *depth, LightfieldLens lens, int x, int y, int width, int height,
+                          int pitch)
+{
+    const float w = depth[(size_t)2 * y * pitch + 2 * x], c = coc_of(w, lens);
+    const float4 base = load_pixel(color + ((size_t)2 * y * width + 2 * x) * 4);
+    float4 sum = (float4)(0.0f);
+    float weights = 0.0f;
+    for (int j = -1; j <= 1; j++)
+        for (int i = -1; i <= 1; i++) {
+            const int u = clamp_index(2 * x + i, width - 1), v = clamp_index(2 * y + j, height - 1);
+            if (!is_similar(depth[(size_t)v * pitch + u], w, c, lens)) continue;
+            const float4 texel = load_pixel(color + ((size_t)v * width + u) * 4);
+            if (!is_same_kind(texel, base)) continue;
+            const float weight = (i ? 0.25f : 0.5f) * (j ? 0.25f : 0.5f);
+            sum += weight * texel;
+            weights += weight;
+        }
+    store_pixel(to_color, weights > 0.0f ? sum * (1.0f / weights) : (float4)(0.0f));
+    *to_depth = w;
+}
+
+/* lightfield_shrink: the first level of the pyramid.
+ * source  Yu, Wang & Yu 2010, section 4.2: a 3x3 Gaussian. Only pixels of the middle one's surface count, so that no
+ *         light leaks across silhouettes.
+ * reads   color      float[peels][height][width][4]
+ *         inv_depth  float[peels][height][pitch]
+ * writes  mips       float[peels][(height+1)/2][(width+1)/2][4]
+ *         mip_depths float[peels][(height+1)/2][(width+1)/2]
+ * range   2-D, one item per texel: (columns, peels * rows), any local size */
+__kernel void lightfield_shrink(__global float *restrict mips, __global float *restrict mip_depths,
+                                const __global float *restrict color, const __global float *restrict inv_depth,
+                                LightfieldSize size, LightfieldLens lens)
+{
+    const int width = (size.width + 1) / 2, height = (size.height + 1) / 2;
+    const int x = get_global_id(0), line = get_global_id(1);
+    if (x >= width || line >= size.peels * height) return;
+    const size_t to = (size_t)line * width + x, peel = (size_t)(line / height) * size.height;
+    shrink(mips + to * 4, mip_depths + to, color + peel * size.width * 4, inv_depth + peel * size.pitch, lens, x,
+           line % height, size.width, size.height, size.pitch);
+}
+
+/* lightfield_shrink_again: a further level, from the one of width x height that starts at `first` to `next`.
+ * updates mips, mip_depths  see lightfield_shrink
+ * range   2-D, one item per texel: (columns, peels * rows), any local size */
+__kernel void lightfield_shrink_again(__global float *mips, __global float *mip_depths, LightfieldLens lens, int peels,
+                                      int width, int height, int first, int next)
+{
+    const int columns = (width + 1) / 2, rows = (height + 1) / 2;
+    const int x = get_global_id(0), line = get_global_id(1);
+    if (x >= columns || line >= peels * rows) return;
+    const size_t to = next + (size_t)line * columns + x, peel = first + (size_t)(line / rows) * width * height;
+    shrink(mips + to * 4, mip_depths + to, mips + peel * 4, mip_depths + peel, lens, x, line % rows, width, height, width);
+}
+
+/* Colour of a ray that no plain cell holds, or that is wide. */
+static inline float4 ray_color(const __global float *color, const __global float *inv_depth, LightfieldSize size,
+                               LightfieldLens lens, uint at, int ray_x, int ray_y, float w, float c, uint seed
+#if LIGHTFIELD_LEVELS
+                               , const __global float *mips, const __global float *mip_depths, LightfieldMips sizes
+#endif
+)
+{
+    const int line = at / (uint)size.pitch, x = at - line * size.pitch;
+    const int m = line / size.height, y = line - m * size.height;
+#if LIGHTFIELD_LEVELS
+    const float width = absolute(c) * lens.cell;
+    const float4 base = LIGHTFIELD_GLASS ? load_pixel(color + ((size_t)line * size.width + x) * 4) : (float4)(1.0f);
+    int level = 0;
+    /* The nearest whole level: log2(width) rounded. */
+    for (float step = 1.41421356f; level < LIGHTFIELD_LEVELS && width >= step; step *= 2.0f) level++;
+    for (; level > 0; level--) {
+        const float4 wide = mip_color(mips, mip_depths, sizes, lens, level, m, ray_x, ray_y, w, c, base);
+        if (wide.w >= 0.0f) return wide;
+    }
+#endif
+#if LIGHTFIELD_LOOKUP == 2
+    return jittered_color(color, inv_depth, size, lens, m, x, y, ray_x, ray_y, w, c, seed);
+#elif LIGHTFIELD_LOOKUP == 1
+    return edge_color(color, inv_depth, size, lens, m, x, y, ray_x, ray_y, w, c);
+#else
+    return load_pixel(color + ((size_t)line * size.width + x) * 4);
+#endif
+}
+
+#if LIGHTFIELD_LEVELS
+#define RAY_COLOR(...) ray_color(__VA_ARGS__, mips, mip_depths, mip_sizes)
+#else
+#define RAY_COLOR(...) ray_color(__VA_ARGS__)
+#endif
+
+/* The layers of a pixel one over the other, for where no view has anything to say. */
+static inline float4 pinhole(const __global float *color, LightfieldSize size, int x, int y)
+{
+    float4 sum = (float4)(0.0f);
+    for (int m = 0; m < size.peels; m++)
+        sum += (1.0f - sum.w) * load_pixel(color + (((size_t)m * size.height + y) * size.width + x) * 4);
+    return sum;
+}
+
+/* lightfield_synthesize: the wide-aperture filter.
+ * source  Yu, Wang & Yu 2010, eqs. 6-7; cos^4 as printed below eq. 7, divided by its sum
+ * reads   winners    uint2[views][planes][out_height][out_pitch]
+ *         color      float[peels][height][width][4]
+ *         inv_depth  float[peels][height][pitch]
+ *         cells      uchar[peels][height][pitch]
+ *         views      LightfieldView[]
+ *         mips, mip_depths  see lightfield_shrink; with LIGHTFIELD_LEVELS
+ * updates sum        float[out_height][out_pitch][4]  colours so far, when not all views come at once
+ *         seen       float[out_height][out_pitch]     their weights
+ * writes  out        float[out_height][out_width][4]  after the last views
+ * range   2-D, one item per SEGMENT pixels of a row, any local size */
+__kernel void lightfield_synthesize(__global float *restrict out, __global float *restrict sum,
+                                    __global float *restrict seen, const __global uint2 *restrict winners,
+                                    const __global float *restrict color, const __global float *restrict inv_depth,
+                                    const __global uchar *restrict cells, const __global LightfieldView *restrict views,
+#if LIGHTFIELD_LEVELS
+                                    const __global float *restrict mips, const __global float *restrict mip_depths,
+                                    LightfieldMips mip_sizes,
+#endif
+                                    LightfieldSize size, LightfieldLens lens, int first_view, int view_count,
+                                    int is_last)
+{
+    const int x0 = SEGMENT * (int)get_global_id(0), y = get_global_id(1);
+    if (x0 >= size.out_width || y >= size.out_height) return;
+    const int n = size.out_width - x0 < SEGMENT ? size.out_width - x0 : SEGMENT;
+    const size_t here = (size_t)y * size.out_pitch + x0, plane_size = (size_t)size.out_height * size.out_pitch;
+    const size_t peel = (size_t)size.height * size.pitch, color_peel = (size_t)size.height * size.width;
+    float4 total[SEGMENT];
+    float weights[SEGMENT];
+    for (int i = 0; i < n; i++) {
+        total[i] = first_view ? load_pixel(sum + (here + i) * 4) : (float4)(0.0f);
+        weights[i] = first_view ? seen[here + i] : 0.0f;
+    }
+    for (int s = 0; s < view_count; s++) {
+        const LightfieldView v = views[first_view + s];
+        const float tangent = 1.0f + lens.cos4 * (v.x * v.x + v.y * v.y);
+        const float weight = 1.0f / (tangent * tangent);
+        const __global uint2 *own = winners + (size_t)s * size.planes * plane_size + here;
+        const uint seed = ((uint)(first_view + s) << 24 ^ (uint)y << 12) + (uint)x0;
+        const float shift_x = SUB * v.x, shift_y = SUB * v.y;
+        const int left = (x0 + size.guard) << 8, top = (y + size.guard) << 8;
+#if LIGHTFIELD_GLASS
+        for (int i = 0; i < n; i++) {
+            /* What stands in front of the hidden-surface winner, nearest first. */
+            uint2 hits[MAX_PLANES];
+            int count = 0;
+            const uint2 solid = own[i];
+            for (int p = 1; p < size.planes; p++) {
+                const uint2 hit = own[p * plane_size + i];
+                if (hit.x == NONE || hit.y > solid.y || (hit.y == solid.y && hit.x > solid.x)) continue;
+                int k = count++;
+                for (; k > 0 && (hits[k - 1].y > hit.y || (hits[k - 1].y == hit.y && hits[k - 1].x > hit.x)); k--)
+                    hits[k] = hits[k - 1];
+                hits[k] = hit;
+            }
+            if (solid.x != NONE) hits[count++] = solid;
+            float4 seen_through = (float4)(0.0f);
+            for (int k = 0; k < count; k++) {
+                const float w = key_depth(hits[k].y), c = coc_of(w, lens);
+                seen_through += (1.0f - seen_through.w)
+                                * RAY_COLOR(color, inv_depth, size, lens, hits[k].x, left + (i << 8) - (int)(c * shift_x),
+                                            top - (int)(c * shift_y), w, c, seed + i);
+            }
+            /* A hole behind glass counts as far as the glass covers it. */
+            total[i] += weight * seen_through;
+            weights[i] += solid.x != NONE ? weight : weight * seen_through.w;
+        }
+#else
+        for (int b = 0; b < n; b += 16) {
+            /* Sixteen pixels' addresses at once, one by one their colours. Words past the image's row are not used. */
+            int16 key, at;
+            if (b + 16 <= n) {
+                const float16 low = load_quad((const __global float *)(own + b));
+                const float16 high = load_quad((const __global float *)(own + b + 8));
+                at = as_int16((float16)(low.even, high.even));
+                key = as_int16((float16)(low.odd, high.odd));
+            } else {
+                for (int i = 0; i < 16; i++) {
+                    const uint2 hit = b + i < n ? own[b + i] : (uint2)(NONE);
+                    ((int *)&at)[i] = hit.x;
+                    ((int *)&key)[i] = hit.y;
+                }
+            }
+            const float16 w = as_float16(~key & 0x7fffffff), c = coc16(w, lens);
+            const int16 ray_x = left + ((b + LANES) << 8) - convert_int16(c * shift_x);
+            const int16 ray_y = top - convert_int16(c * shift_y);
+            const int16 cell_x = ray_x >> 8, cell_y = ray_y >> 8;
+            int16 peel_at = 0, color_at = 0;
+            for (int m = 1; m < size.peels; m++) {
+                const int16 is_behind = at >= m * (int)peel;
+                peel_at = is_behind ? (int16)(m * (int)peel) : peel_at;
+                color_at = is_behind ? (int16)(m * (int)color_peel) : color_at;
+            }
+            const int16 cell = peel_at + cell_y * size.pitch + cell_x;
+            color_at += cell_y * size.width + cell_x;
+            /* The winner has to be one of the cell's four corners. */
+            const int16 off = at - cell;
+            int16 is_plain = (cell_x >= 0) & (cell_x + 1 < size.width) & (cell_y >= 0) & (cell_y + 1 < size.height)
+                             & ((off == 0) | (off == 1) | (off == size.pitch) | (off == size.pitch + 1));
+#if LIGHTFIELD_LEVELS
+            is_plain &= absolute16(c) * lens.cell < 1.41421356f;
+#endif
+            const float16 fx = convert_float16(ray_x & 255) * (1.0f / SUB), fy = convert_float16(ray_y & 255) * (1.0f / SUB);
+            const int end = n - b < 16 ? n - b : 16;
+            for (int i = 0; i < end; i++) {
+                const uint winner = ((const uint *)&at)[i];
+                if (winner == NONE) continue;
+                float4 found;
+                if (LIGHTFIELD_LOOKUP == 1 && ((const int *)&is_plain)[i] && cells[((const int *)&cell)[i]]) {
+                    const __global float *corner = color + (size_t)((const uint *)&color_at)[i] * 4;
+                    const float gx = ((const float *)&fx)[i], gy = ((const float *)&fy)[i];
+                    const float4 p = load_pixel(corner), q = load_pixel(corner + size.width * 4);
+                    const float4 above = p + gx * (load_pixel(corner + 4) - p);
+                    const float4 below = q + gx * (load_pixel(corner + size.width * 4 + 4) - q);
+                    found = above + gy * (below - above);
+                } else {
+                    found = RAY_COLOR(color, inv_depth, size, lens, winner, ((const int *)&ray_x)[i],
+                                      ((const int *)&ray_y)[i], ((const float *)&w)[i], ((const float *)&c)[i],
+                                      seed + b + i);
+                }
+                total[b + i] += weight * found;
+                weights[b + i] += weight;
+            }
+        }
+#endif
+    }
+    for (int i = 0; i < n; i++) {
+        if (!is_last) {
+            store_pixel(sum + (here + i) * 4, total[i]);
+            seen[here + i] = weights[i];
+            continue;
+        }
+        float4 pixel = weights[i] > MIN_WEIGHT ? total[i] * (1.0f / weights[i])
+                                               : pinhole(color, size, x0 + i + size.guard, y + size.guard);
+        pixel.w = pixel.w < 1.0f ? pixel.w : 1.0f;
+        store_pixel(out + ((size_t)y * size.out_width + x0 + i) * 4, pixel);
+    }
+}
