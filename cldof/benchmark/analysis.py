@@ -44,11 +44,18 @@ class EqualError(NamedTuple):
         return f"{self.bound}{self.ratio(row):.2g}x"
 
 
-def equal_error(record: Record, row: Row, judge: str = "method") -> EqualError | None:
+# These integrate over the area of a pixel, as a row with supersampling does: the jittered reference judges them.
+_INTEGRATE_PIXELS = frozenset({"mitsuba"})
+
+
+def equal_error(record: Record, row: Row, judge: str | None = None) -> EqualError | None:
     """Accumulation at the PSNR of a row, from the ladder of the same case; straight lines in log time.
 
-    Outside of the ladder it is the nearest end, with ``bound`` telling on which side the truth lies.
+    Outside of the ladder it is the nearest end, with ``bound`` telling on which side the truth lies. Without a
+    ``judge`` it is the picture for what integrates over pixels, else the method.
     """
+    if judge is None:
+        judge = "picture" if row.method in _INTEGRATE_PIXELS or row.supersample > 1 else "method"
     wanted = row.error("psnr_db", judge)
     own = _judge_of_accumulation(row, judge)
     points = []
@@ -241,6 +248,9 @@ def summary_table(record: Record, unlit: bool = False) -> tuple[list[str], list[
         "picture dB",
         "speed-up",
     ]
+    many = len({row.device for row in record.rows.values() if row.kernels is not None}) > 1
+    if many:
+        heads.insert(2, "device")
     groups: dict[tuple[str, str, str, str], list[Row]] = {}
     for row in record.rows.values():
         case = record.cases[row.case]
@@ -248,7 +258,7 @@ def summary_table(record: Record, unlit: bool = False) -> tuple[list[str], list[
             size = f"{case['width']}x{case['height']}"
             groups.setdefault((row.method, row.setting, size, row.device), []).append(row)
     cells = []
-    for (method, setting, size, _), rows in groups.items():
+    for (method, setting, size, device), rows in groups.items():
         found = [(equal, row) for row in rows if (equal := equal_error(record, row)) is not None]
         ratios = [equal.ratio(row) for equal, row in found]
         bound = {equal.bound for equal, _ in found}
@@ -256,6 +266,7 @@ def summary_table(record: Record, unlit: bool = False) -> tuple[list[str], list[
             [
                 method,
                 setting,
+                *([device] if many else []),
                 size,
                 str(len(rows)),
                 _middle([row.total_ms for row in rows], ".1f"),
