@@ -226,9 +226,10 @@ __kernel void multiview_split(__global float *restrict layers, const __global fl
     }
 }
 
-/* multiview_past: where the view goes past everything in a frame that is not opaque.
+/* multiview_past: where the void is seen past everything in a frame that is not opaque: in columns of peels that let
+ * light through, and behind those that end before the last peel, since nothing else can be there.
  * reads   color   float[peels][height][width][4]
- * writes  layers  float[slot][height][pitch][4]  (0, 0, 0, 1) where some light of the void comes through, else 0
+ * writes  layers  float[slot][height][pitch][4]  (0, 0, 0, 1) where the void is known to be, else 0
  * range   2-D, one item per row: (1, height), any local size */
 __kernel void multiview_past(__global float *restrict layers, const __global float *restrict color, MultiviewSize size,
                              int slot)
@@ -237,10 +238,13 @@ __kernel void multiview_past(__global float *restrict layers, const __global flo
     if (y >= size.height) return;
     __global float *out = layers + ((size_t)slot * size.height + y) * size.pitch * 4;
     for (int x = 0; x < size.pitch; x++) {
-        float through = x < size.width ? 1.0f : 0.0f;
-        for (int m = 0; m < (x < size.width ? size.peels : 0); m++)
-            through *= 1.0f - color[(((size_t)m * size.height + y) * size.width + x) * 4 + 3];
-        store_pixel(out + 4 * x, (float4)(0.0f, 0.0f, 0.0f, through > MULTIVIEW_CLOSED ? 1.0f : 0.0f));
+        float through = x < size.width ? 1.0f : 0.0f, alpha = 1.0f;
+        for (int m = 0; m < (x < size.width ? size.peels : 0); m++) {
+            alpha = color[(((size_t)m * size.height + y) * size.width + x) * 4 + 3];
+            through *= 1.0f - alpha;
+        }
+        const int is_void = through > MULTIVIEW_CLOSED || alpha == 0.0f;
+        store_pixel(out + 4 * x, (float4)(0.0f, 0.0f, 0.0f, is_void ? 1.0f : 0.0f));
     }
 }
 

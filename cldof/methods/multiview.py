@@ -11,8 +11,6 @@ Where this differs from the paper, docs/methods/multiview.md has the measurement
   search by false position. All pixels of a run then move alike, and look-ups are contiguous.
 - Layers overlap as far as the surface slopes from pixel to pixel, not by a fixed 10 %.
 - Cones see means over windows of exactly their width, not mip levels.
-- Look-ups are rounded to whole pixels with an offset that differs from ray to ray, which softens as half a bilinear
-  filter would, for nothing.
 - The number of rays follows the blur of what a cell of 16 x 16 pixels can see.
 """
 
@@ -51,9 +49,7 @@ _LAYER_BYTES = 1 << 30
 _FEWEST_LAYERS = 5
 
 # Width of a cone over the mean distance of lens samples.
-_CONE_WIDTH = 1.2
-# Width in px of the offsets by which look-ups are rounded.
-_ROUNDING = 0.5
+_CONE_WIDTH = 1.1
 # Rays per px^2 of the largest circle of confusion that a cell can see, below which the number of rays is cut.
 _RAYS_PER_PX2 = 2.0
 # Pixels of the jitter pattern along x and y.
@@ -213,8 +209,8 @@ def cones(layers: LensLayers, rays: int) -> list[Cone | None]:
 def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
     """Shifts of all rays at all layers.
 
-    The first set has one ray, for cells in focus; then, when adaptive, come powers of two below ``rays``; then ``rays``.
-    With jitter there are 16 patterns of each.
+    The first set has one ray, for cells in focus; when adaptive, powers of two below ``rays`` follow; ``rays`` come
+    last. With jitter there are 16 patterns of each.
     """
     counts = [1]
     if method.adaptive:
@@ -229,7 +225,7 @@ def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
             shifts.append(_shifts(layers, count, method.seed * patterns + pattern))
             first += count
     all_shifts = np.concatenate(shifts)
-    moves = np.abs(shifts[-1]).max(axis=(0, 2)) > 0 if patterns == 1 else np.abs(all_shifts).max(axis=(0, 2)) > 0
+    moves = np.abs(all_shifts).max(axis=(0, 2)) > 0
     needs = np.full(layers.total, len(counts) - 1)
     if method.adaptive:
         wanted = _RAYS_PER_PX2 * math.pi * (np.abs(layers.coc) + 0.5) ** 2
@@ -241,12 +237,7 @@ def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
 def _shifts(layers: LensLayers, count: int, seed: int) -> NDArray[np.int32]:
     # The ray through lens point v meets C at p + C * (-v.x, v.y), y down.
     points = layers.aperture.samples(count, seed) * (-1.0, 1.0)
-    index = np.arange(count)
-    root = 1.32471795724474602596  # Roberts' R2 sequence, unrelated to the spiral of the lens
-    offsets = (0.5 + index[:, None] / (root, root * root)) % 1.0 - 0.5
-    places = points[:, None] * layers.coc[None, :, None] + np.where(layers.coc != 0.0, _ROUNDING, 0.0)[:, None] * (
-        offsets[:, None]
-    )
+    places = points[:, None] * layers.coc[None, :, None]
     return np.asarray(np.floor(places + 0.5), dtype=np.int32)
 
 
@@ -281,7 +272,9 @@ class _Builder:
         ]
 
     def build(self) -> FrameProgram:
-        windows = cones(self.layers, self.method.rays) if self.method.cone else [None] * self.layers.total
+        windows: list[Cone | None] = [None] * self.layers.total
+        if self.method.cone:
+            windows = cones(self.layers, self.method.rays)
         rays = ray_sets(self.method, self.layers)
         self._classify(windows, rays)
         self._split(windows)

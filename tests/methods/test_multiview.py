@@ -1,0 +1,348 @@
+"""The multiview method end to end: against its float64 twin, and what every method promises (DESIGN section 4)."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cldof import Camera, InputError, LayeredFrame, Lens
+from cldof.host.device import Device
+from cldof.host.passes import FrameProgram
+from cldof.lens import GaussianAperture, PolygonAperture
+from cldof.methods import FrameShape
+from cldof.methods.multiview import MAX_LAYERS, Multiview, cones, ray_sets
+from cldof.renderer import _inverse_depth_program
+from tests.frames import noise_frame, plane_frame
+from tests.oracles import multiview as oracle
+from tests.running import run_program
+from tests.tolerances import assert_close
+
+
+def inverse_depth(device: Device, frame: LayeredFrame) -> np.ndarray:
+    shape = FrameShape.of(frame)
+    inputs = {"color": frame.color, "depth": frame.depth}
+    size = (shape.layers, shape.height, shape.pitch)
+    return run_program(device, _inverse_depth_program(shape), inputs, {}, "inv_depth", size)
+
+
+def render(device: Device, frame: LayeredFrame, lens: Lens, one_ray: np.ndarray | None = None, **options) -> np.ndarray:
+    """Render; with ``one_ray``, (K, 2), every pixel sends this ray alone."""
+    method = Multiview(**options)
+    shape = FrameShape.of(frame)
+    plan = method.plan(frame, lens)
+    program = method.program(shape, plan, device.traits)
+    if one_ray is not None:
+        buffers = dict(program.buffers)
+        for name, data in (
+            ("shifts", np.repeat(one_ray[None], 1, 0)),
+            ("ray_sets", np.repeat([[0, 1]], 16, 0)),
+        ):
+            data = np.ascontiguousarray(data, np.int32)
+            buffers[name] = replace(buffers[name], nbytes=data.nbytes, data=data)
+        program = FrameProgram(buffers, program.passes)
+    inputs = {"color": frame.color, "inv_depth": inverse_depth(device, frame)}
+    return run_program(device, program, inputs, dict(plan.params), "image", (*shape.output_size, 4))
+
+
+def twin(device: Device, frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:
+    method = Multiview(adaptive=False, **options)
+    layers = method.plan(frame, lens).structure
+    rays = ray_sets(method, layers)
+    first, count = rays.ranges[-1]
+    windows = cones(layers, method.rays) if method.cone else [None] * layers.total
+    inverse = inverse_depth(device, frame)[..., : frame.width].astype(np.float64)
+    return oracle.render(
+        frame.color,
+        inverse,
+        *lens.coc_coefficients(frame.camera),
+        layers.bounds.astype(np.float64),
+        windows,
+        rays.shifts[first : first + count],
+        opaque=frame.is_opaque,
+        guard=frame.guard_px,
+    )
+
+
+SIZES = [(1, 1), (1, 29), (31, 1), (37, 21), (131, 67), (64, 8)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("opaque", [True, False], ids=["opaque", "void"])
+@pytest.mark.parametrize("cone", [True, False], ids=["cone", "ray"])
+def test_meets_the_oracle(device: Device, size: tuple[int, int], opaque: bool, cone: bool) -> None:
+    frame = noise_frame(*size, opaque=opaque, seed=size[0])
+    lens = Lens(8.0 / frame.camera.focal_px, 1.7)
+    options = {"cone": cone, "rays": 13}
+    assert_close(
+        render(device, frame, lens, adaptive=False, **options), twin(device, frame, lens, **options), "multiview"
+    )
+
+
+@pytest.mark.parametrize("options", [{"delta_px": 2.0}, {"layers": 5}, {"rays": 1}, {"rays": 3}, {"seed": 7}])
+def test_options_meet_the_oracle(device: Device, options: dict) -> None:
+    frame = noise_frame(90, 70, guard_px=9)
+    lens = Lens(10.0 / frame.camera.focal_px, 2.0)
+    options = {"rays": 9, **options}
+    image = render(device, frame, lens, adaptive=False, **options)
+    assert_close(image, twin(device, frame, lens, **options), "multiview")
+
+
+@pytest.mark.parametrize(
+    "aperture", [PolygonAperture(5, rotation_deg=20.0), PolygonAperture(6, ratio=2.0), GaussianAperture()]
+)
+def test_apertures_meet_the_oracle(device: Device, aperture: object) -> None:
+    frame = noise_frame(90, 70)
+    lens = Lens(10.0 / frame.camera.focal_px, 2.0, aperture=aperture)
+    image = render(device, frame, lens, adaptive=False, rays=9)
+    assert_close(image, twin(device, frame, lens, rays=9), "multiview")
+
+
+@pytest.mark.parametrize("layers", [1, 2, 6])
+@pytest.mark.parametrize("focus", [0.7, 1.7, math.inf], ids=["all behind focus", "between", "all in front"])
+def test_any_number_of_peels_and_one_sided_frames(device: Device, layers: int, focus: float) -> None:
+    frame = noise_frame(75, 44, layers)
+    lens = Lens(6.0 / frame.camera.focal_px, focus)
+    image = render(device, frame, lens, adaptive=False, rays=8)
+    assert_close(image, twin(device, frame, lens, rays=8), "multiview")
+
+
+@pytest.mark.parametrize("jitter", [False, True])
+@pytest.mark.parametrize("opaque", [True, False], ids=["opaque", "void"])
+def test_culling_changes_no_bit(device: Device, jitter: bool, opaque: bool) -> None:
+    frame = noise_frame(131, 167, opaque=opaque, guard_px=5)
+    lens = Lens(5.0 / frame.camera.focal_px, 1.7)
+    options = {"rays": 12, "jitter": jitter}
+    lists = render(device, frame, lens, **options)
+    np.testing.assert_array_equal(render(device, frame, lens, cull=False, **options), lists)
+
+
+def hills(width: int = 96, height: int = 80) -> LayeredFrame:
+    """A floor through focus, balls before and behind it, a wall; every slot's colour is its own number."""
+    camera = Camera(width, height, 40.0)
+    y, x = np.mgrid[:height, :width].astype(float)
+    surfaces = [np.full((height, width), 1 / 6.0), np.clip((y - 20) / height * 1.1, 1e-3, None)]
+    for cx, cy, radius, near in ((24, 30, 14, 0.95), (60, 44, 18, 0.7), (75, 20, 9, 0.4), (40, 60, 10, 0.3)):
+        inside = 1.0 - ((x - cx) ** 2 + (y - cy) ** 2) / radius**2
+        for side in (1.0, -1.0):
+            surfaces.append(np.where(inside > 0, near + side * 0.04 * np.sqrt(np.maximum(inside, 0)), 0.0))
+    inverse = np.sort(np.stack(surfaces), axis=0)[:1:-1]
+    with np.errstate(divide="ignore"):
+        depth = (1.0 / inverse).astype(np.float32)
+    color = np.zeros((*depth.shape, 4), np.float32)
+    color[..., 0] = np.arange(depth.size).reshape(depth.shape)
+    color[..., 3] = depth < np.inf
+    color[..., 0] *= color[..., 3]
+    return LayeredFrame(color, depth, camera)
+
+
+def test_rays_hit_what_dense_marching_hits(device: Device) -> None:
+    """One ray per pixel through smooth surfaces: the same pixel of a peel or its neighbour, within a layer.
+
+    Where that is not so the ray grazes a silhouette: half a layer to and fro decides what it meets.
+    """
+    frame = hills()
+    lens = Lens(12.0 / frame.camera.focal_px, 1.9)
+    layers = Multiview().plan(frame, lens).structure
+    inverse = np.where(frame.color[..., 3] > 0, 1.0 / frame.depth.astype(np.float64), -1.0)
+    columns = oracle.slots(inverse, *lens.coc_coefficients(frame.camera))
+    # Pixels of which no ray leaves the frame.
+    reach = math.ceil(np.abs(layers.coc).max()) + 1
+    inner = (slice(reach, -reach), slice(reach, -reach))
+    agree, explained = [], []
+    for point in lens.aperture.samples(16, seed=2):
+        image = render(device, frame, lens, one_ray=np.floor(point * layers.coc[:, None] + 0.5), cone=False)
+        found = image[..., 0].astype(int)
+        peel, row, column = np.unravel_index(found, frame.depth.shape)
+        coc = columns.near[peel, row, column]
+        same = []
+        for offset in (0.0, -0.5, 0.5):
+            moved = oracle.Slots(*(end + offset * layers.delta_px for end in columns))
+            hits = oracle.march(moved, point, layers.delta_px / 16)
+            beside = (abs(row - hits.row) <= 1) & (abs(column - hits.column) <= 1)
+            same.append((beside & (abs(coc - hits.coc) <= 1.5 * layers.delta_px))[inner])
+        agree.append(same[0].mean())
+        explained.append(np.any(same, axis=0).mean())
+    assert np.mean(agree) >= 0.995
+    assert np.mean(explained) >= 0.999
+
+
+def test_aperture_zero_is_the_pinhole_image(device: Device) -> None:
+    for guard in (0, 3):
+        frame = noise_frame(61, 47, guard_px=guard)
+        np.testing.assert_allclose(render(device, frame, Lens(0.0, 2.0)), frame.pinhole_image(), atol=1e-6)
+        color = frame.color.copy()
+        color[..., :3] /= np.maximum(color[..., 3:], 1e-6)
+        color[..., 3] = 1.0
+        opaque = LayeredFrame(color, frame.depth, frame.camera, guard_px=guard)
+        np.testing.assert_array_equal(render(device, opaque, Lens(0.0, 2.0)), opaque.pinhole_image())
+    frame = noise_frame(61, 47, opaque=False)
+    np.testing.assert_allclose(render(device, frame, Lens(0.0, 2.0)), frame.pinhole_image(), atol=1e-6)
+
+
+@pytest.mark.parametrize("depth", [0.3, 1.0, 1.99, 2.01, 7.0, math.inf])
+@pytest.mark.parametrize("jitter", [False, True])
+def test_a_constant_stays_constant(device: Device, depth: float, jitter: bool) -> None:
+    image = np.broadcast_to(np.float32((0.2, 3.0, 0.7, 1.0)), (40, 70, 4))
+    frame = plane_frame(image, depth)
+    out = render(device, frame, Lens(20.0 / frame.camera.focal_px, 2.0), jitter=jitter)
+    np.testing.assert_allclose(out, image, rtol=2e-5)
+
+
+@pytest.mark.parametrize("adaptive", [True, False])
+def test_the_plane_in_focus_stays_between_blurred_things(device: Device, adaptive: bool) -> None:
+    image = np.random.default_rng(1).random((40, 400, 4), np.float32)
+    image[..., 3] = 1.0
+    depth = np.full((40, 400), 2.0, np.float32)
+    depth[:, 300:] = 9.0
+    frame = LayeredFrame(image, depth, Camera(400, 40, 40.0))
+    out = render(device, frame, Lens(8.0 / frame.camera.focal_px, 2.0), adaptive=adaptive)
+    np.testing.assert_array_equal(out[:, :256], image[:, :256])
+    assert np.abs(out[:, 320:] - image[:, 320:]).max() > 0.1
+
+
+@pytest.mark.parametrize("degrees", [0.0, 45.0, 80.0])
+def test_a_slope_lets_nothing_through(device: Device, degrees: float) -> None:
+    """White through focus before a black sky: where a layer ends, the next one must take over without a gap."""
+    camera = Camera(128, 96, 40.0)
+    y = (np.arange(96) + 0.5 - 48) / camera.focal_px
+    inverse = np.clip((1.0 - math.tan(math.radians(degrees)) * y) / 2.0, 0.02, 4.0)
+    depth = np.full((2, 96, 128), np.inf, np.float32)
+    depth[0] = 1.0 / inverse[:, None]
+    color = np.ones((2, 96, 128, 4), np.float32)
+    color[1, ..., :3] = 0.0
+    frame = LayeredFrame(color, depth, camera)
+    lens = Lens(6.0 / camera.focal_px, 2.0)
+    assert render(device, frame, lens, cone=False)[..., :3].min() > 0.999
+    assert render(device, frame, lens)[..., :3].min() > 0.98
+
+
+@pytest.mark.parametrize("depth", [1.2, 1.99, 2.0, 9.0])
+@pytest.mark.parametrize("alpha", [1 / 255, 0.5, 0.99])
+@pytest.mark.parametrize("opaque", [True, False], ids=["wall", "void"])
+def test_glass_lets_through_what_its_alpha_says(device: Device, depth: float, alpha: float, opaque: bool) -> None:
+    color = np.zeros((2, 24, 40, 4), np.float32)
+    color[0] = np.float32((0.1, 0.5, 0.2, 1.0)) * np.float32(alpha)
+    z = np.full((2, 24, 40), np.inf, np.float32)
+    z[0] = depth
+    if opaque:
+        color[1], z[1] = (0.9, 0.3, 4.0, 1.0), 20.0
+    frame = LayeredFrame(color, z, Camera(40, 24, 40.0), guard_px=0)
+    out = render(device, frame, Lens(3.0 / frame.camera.focal_px, 2.0))[8:-8, 8:-8]
+    np.testing.assert_allclose(out, frame.pinhole_image()[8:-8, 8:-8], atol=2e-5, rtol=2e-5)
+
+
+def test_highlights_stay_finite_and_keep_their_energy(device: Device) -> None:
+    image = np.zeros((121, 121, 4), np.float32)
+    image[..., 3] = 1.0
+    image[60, 60, :3] = 1e6
+    frame = plane_frame(image, 1.2)
+    lens = Lens(24.0 / frame.camera.focal_px, 2.0)
+    light = render(device, frame, lens)[..., 0].astype(np.float64)
+    assert light.sum() == pytest.approx(1e6, rel=1e-4)
+    y, x = np.mgrid[-60:61, -60:61]
+    radius = math.sqrt(2.0 * (light * (x**2 + y**2)).sum() / light.sum())
+    assert radius == pytest.approx(abs(float(lens.coc_radius_px(frame.camera, 1.2))), rel=0.04)
+
+
+@pytest.mark.parametrize("depth", [1.0, 9.0], ids=["before focus", "behind focus"])
+def test_bokeh_is_the_right_way_up(device: Device, depth: float) -> None:
+    """A triangle with a corner on top: upright behind the focus, upside down before it; as lens.py says."""
+    image = np.zeros((81, 81, 4), np.float32)
+    image[..., 3] = 1.0
+    image[40, 40, :3] = 1e3
+    frame = plane_frame(image, depth)
+    lens = Lens(40.0 / frame.camera.focal_px, 2.0, aperture=PolygonAperture(3, rotation_deg=90.0))
+    light = render(device, frame, lens, rays=256)[..., 0]
+    rows = np.flatnonzero(light.sum(axis=1) > 1.0) - 40
+    corner, base = (rows.min(), rows.max()) if depth > 2.0 else (rows.max(), rows.min())
+    assert abs(corner) > 1.5 * abs(base)
+
+
+def test_same_input_same_bits(device: Device) -> None:
+    frame = noise_frame(100, 50, opaque=False)
+    lens = Lens(12.0 / frame.camera.focal_px, 1.7)
+    first = render(device, frame, lens, jitter=True)
+    for _ in range(3):
+        np.testing.assert_array_equal(render(device, frame, lens, jitter=True), first)
+
+
+@settings(max_examples=25)
+@given(
+    width=st.integers(1, 90),
+    height=st.integers(1, 60),
+    layers=st.integers(1, 4),
+    seed=st.integers(0, 10**6),
+    opaque=st.booleans(),
+    jitter=st.booleans(),
+    rays=st.integers(1, 20),
+    aperture_px=st.floats(0.0, 60.0),
+    focus=st.floats(0.2, 50.0),
+)
+def test_random_frames_keep_the_promises(
+    device: Device,
+    width: int,
+    height: int,
+    layers: int,
+    seed: int,
+    opaque: bool,
+    jitter: bool,
+    rays: int,
+    aperture_px: float,
+    focus: float,
+) -> None:
+    frame = noise_frame(width, height, layers, seed=seed, opaque=opaque)
+    lens = Lens(aperture_px / frame.camera.focal_px, focus)
+    out = render(device, frame, lens, rays=rays, jitter=jitter)
+    assert np.isfinite(out).all()
+    assert out.min() >= 0.0
+    assert out.max() <= 1.0 + 1e-4
+    assert (out[..., 3] <= 1.0).all()
+    if opaque:
+        assert np.isin(out[..., 3], (0.0, 1.0)).all()
+        # No ray of a pixel may meet anything known, if the frame is smaller than the blur.
+        assert (out[..., 3] == 1.0).all() or min(width, height) < 2.5 * aperture_px
+
+
+def test_adaptive_rays_change_little(device: Device) -> None:
+    frame = noise_frame(96, 96)
+    lens = Lens(3.0 / frame.camera.focal_px, 1.7)
+    many, few = (render(device, frame, lens, rays=256, adaptive=adaptive) for adaptive in (False, True))
+    assert np.sqrt(((many - few) ** 2).mean()) < 0.01
+
+
+def test_layers_reach_the_coc_range() -> None:
+    frame = noise_frame(40, 30)
+    lens = Lens(4.0 / frame.camera.focal_px, 1.7)
+    plan = Multiview().plan(frame, lens)
+    coc, delta = plan.structure.coc, plan.structure.delta_px
+    assert delta == 0.5
+    assert abs(coc[0] + plan.summary["largest_near_coc_px"]) <= delta
+    assert abs(coc[-1] - plan.summary["largest_far_coc_px"]) <= delta
+    assert coc[plan.structure.front] == 0.0
+    huge = Lens(5000.0 / frame.camera.focal_px, 1.7)
+    assert Multiview().plan(frame, huge).structure.total <= MAX_LAYERS
+    assert Multiview(layers=6).plan(frame, huge).structure.total <= 6
+
+
+def test_an_enormous_aperture_is_rendered(device: Device) -> None:
+    frame = noise_frame(50, 40)
+    assert np.isfinite(render(device, frame, Lens(5000.0 / frame.camera.focal_px, 1.7))).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rays": 0}, "rays is 0"),
+        ({"rays": 1025}, "from 1 to 1024"),
+        ({"rays": 2.5}, "rays is 2.5"),
+        ({"layers": 4}, "from 5 to 32"),
+        ({"delta_px": 0.0}, "delta_px"),
+        ({"seed": -1}, "seed is -1"),
+    ],
+)
+def test_bad_options_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Multiview(**options)

@@ -1,0 +1,172 @@
+"""The multiview method in float64, from Lee, Eisemann & Seidel 2009 and the choices in docs/methods/multiview.md."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+NOTHING = np.inf
+
+
+class Slots(NamedTuple):
+    """Peels as columns in CoC space: near end (inf where nothing is) and far end in px, (M, H, W) each."""
+
+    near: np.ndarray
+    far: np.ndarray
+
+
+def slots(inverse_depth: np.ndarray, c1: float, c0: float) -> Slots:
+    """Near end of each slot, and how far its surface goes on behind it on the way to the next pixels.
+
+    ``inverse_depth`` is negative where nothing is.
+    """
+    there = inverse_depth >= 0.0
+    near = np.where(there, c1 * inverse_depth + c0, 1e30)
+    far = near.copy()
+    for axis in (1, 2):
+        steps = []
+        for shift in (1, -1):
+            step = np.abs(np.roll(near, shift, axis) - near)
+            edge = [slice(None)] * 3
+            edge[axis] = slice(0, 1) if shift == 1 else slice(-1, None)
+            step[tuple(edge)] = np.inf
+            steps.append(step)
+        least = np.minimum(*steps)
+        far += np.where(least > 2.0, 0.0, least)
+    return Slots(np.where(there, near, np.inf), np.where(there, far, -np.inf))
+
+
+def split(color: np.ndarray, columns: Slots, bounds: np.ndarray) -> np.ndarray:
+    """Layers (K, H, W, 4): in each the columns that reach into it, front to back; glass only where it begins."""
+    layers = np.zeros((len(bounds) - 1, *color.shape[1:]))
+    for layer, low, high in zip(layers, bounds[:-1], bounds[1:], strict=True):
+        for rgba, near, far in zip(color, columns.near, columns.far, strict=True):
+            reaches = (near < high) & (far >= low)
+            is_in = np.where(rgba[..., 3] >= 0.998, reaches, reaches & (near >= low))
+            layer += rgba * ((1.0 - layer[..., 3]) * is_in)[..., None]
+    return layers
+
+
+def cone(image: np.ndarray, radius: int, edge: float) -> np.ndarray:
+    """Mean over a square window of ``2 * radius + 1 + 2 * edge`` pixels; beyond the image its edge goes on."""
+    taps = np.array([edge, *[1.0] * (2 * radius + 1), edge])
+    taps /= taps.sum()
+    for axis in (0, 1):
+        pad = [(0, 0)] * image.ndim
+        pad[axis] = (radius + 1, radius + 1)
+        padded = np.pad(image, pad, "edge")
+        count = image.shape[axis]
+        image = sum(tap * np.take(padded, np.arange(count) + i, axis) for i, tap in enumerate(taps))
+    return image
+
+
+def past(color: np.ndarray) -> np.ndarray:
+    """Where the void is known to be seen, (H, W)."""
+    through = np.prod(1.0 - color[..., 3], axis=0)
+    return ((through > 1e-3) | (color[-1, ..., 3] == 0.0)).astype(float)
+
+
+def trace(layers: np.ndarray, shifts: np.ndarray, void: np.ndarray | None = None) -> np.ndarray:
+    """All rays of all pixels.
+
+    Parameters
+    ----------
+    layers : (K, H, W, 4)
+    shifts : (rays, K, 2)
+        Right and down, in px.
+    void : (H, W), optional
+        For frames that are not opaque.
+
+    Returns
+    -------
+    (H, W, 4)
+    """
+    height, width = layers.shape[1:3]
+    y, x = np.mgrid[:height, :width]
+    total, known = np.zeros((height, width, 4)), np.zeros((height, width))
+    for ray in shifts:
+        left = np.ones((height, width))
+        for layer, (dx, dy) in zip(layers, ray, strict=True):
+            at_x, at_y = np.clip(x + dx, 0, width - 1), np.clip(y + dy, 0, height - 1)
+            inside = (at_x == x + dx) & (at_y == y + dy)
+            met = layer[at_y, at_x]
+            total += np.where(inside, left, 0.0)[..., None] * met
+            left = left * (1.0 - met[..., 3])
+        if void is not None:
+            known += np.where(inside, left * void[at_y, at_x], 0.0)
+    known += total[..., 3]
+    enough = known > 1e-4 * len(shifts)
+    result = np.where(enough[..., None], total / np.where(enough, known, 1.0)[..., None], 0.0)
+    if void is None:
+        result[..., 3] = enough
+    return result
+
+
+def render(
+    color: np.ndarray,
+    inverse_depth: np.ndarray,
+    c1: float,
+    c0: float,
+    bounds: np.ndarray,
+    windows: list,
+    shifts: np.ndarray,
+    *,
+    opaque: bool,
+    guard: int = 0,
+) -> np.ndarray:
+    """A whole frame with the same rays at every pixel."""
+    color = color.astype(np.float64)
+    columns = slots(inverse_depth, c1, c0)
+    layers = split(color, columns, bounds)
+    layers = np.stack([cone(one, *window) if window else one for one, window in zip(layers, windows, strict=True)])
+    image = trace(layers, shifts, None if opaque else past(color))
+    inner = slice(guard, -guard or None)
+    return image[inner, inner]
+
+
+class Hits(NamedTuple):
+    """What each pixel's ray meets first: peel, row and column, or -1; and its signed CoC radius in px."""
+
+    peel: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    coc: np.ndarray
+
+
+def march(columns: Slots, point: np.ndarray, step_px: float) -> Hits:
+    """Brute force: follow one ray per pixel in small steps of C until it is inside a column.
+
+    Parameters
+    ----------
+    columns : Slots
+    point : (2,)
+        Where the ray moves per px of C, right and down.
+    step_px : float
+        In C.
+    """
+    height, width = columns.near.shape[1:]
+    y, x = np.mgrid[:height, :width]
+    there = np.isfinite(columns.near)
+    hits = Hits(*(np.full((height, width), -1) for _ in range(3)), np.full((height, width), np.nan))
+    start, end = columns.near[there].min(), columns.far[there].max()
+    for c in np.arange(start - step_px, end + step_px, step_px):
+        at_x = np.floor(x + point[0] * c + 0.5).astype(int)
+        at_y = np.floor(y + point[1] * c + 0.5).astype(int)
+        inside = (at_x >= 0) & (at_x < width) & (at_y >= 0) & (at_y < height) & (hits.peel < 0)
+        at_x, at_y = np.clip(at_x, 0, width - 1), np.clip(at_y, 0, height - 1)
+        for m in range(len(columns.near)):
+            near, far = columns.near[m][at_y, at_x], columns.far[m][at_y, at_x]
+            met = inside & (near < c + step_px / 2) & (far >= c - step_px / 2) & (hits.peel < 0)
+            for field, value in zip(hits, (m, at_y, at_x, near), strict=True):
+                np.copyto(field, value, where=met, casting="unsafe")
+    return hits
+
+
+def nbuffer(cells: np.ndarray, levels: int) -> np.ndarray:
+    """Union over squares of 2^level cells from each cell on, cut by the frame; (levels, rows, columns)."""
+    out = np.zeros((levels, *cells.shape), cells.dtype)
+    for level in range(levels):
+        for j in range(cells.shape[0]):
+            for i in range(cells.shape[1]):
+                square = cells[j : j + (1 << level), i : i + (1 << level)]
+                out[level, j, i] = np.bitwise_or.reduce(square.ravel())
+    return out
