@@ -16,6 +16,8 @@ __all__ = ["accuracy_plot", "has_matplotlib", "save_plots"]
 
 _COLORS = ("#0b6e99", "#c2410c", "#4d7c0f", "#7c3aed", "#be185d", "#0f766e", "#a16207", "#475569")
 _MARKERS = "osD^vPX*"
+# Labels nearer to each other than this, in decades of time and in dB, would overlap.
+_LABEL_DECADES, _LABEL_DB = 0.25, 0.7
 
 
 def has_matplotlib() -> bool:
@@ -51,6 +53,7 @@ def accuracy_plot(record: Record, case: str, judge: str = "method") -> bytes:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     rows = record.rows_of(case)
+    told: list[tuple[float, float]] = []
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row.method, row.device), []).append(row)
@@ -74,7 +77,10 @@ def accuracy_plot(record: Record, case: str, judge: str = "method") -> bytes:
             times, levels, color=color, marker=marker, s=34, label=name, zorder=3, edgecolors="white", linewidths=0.6
         )
         for row, at, level in zip(kept, times, levels, strict=True):
-            _tell(axes, row.setting, at, level, color)
+            # Of labels that would lie on each other the first one stays.
+            if all(abs(math.log10(at / x)) > _LABEL_DECADES or abs(level - y) > _LABEL_DB for x, y in told):
+                told.append((at, level))
+                _tell(axes, row.setting, at, level, color)
     kind = "not jittered" if judge == "method" else "jittered"
     axes.set_xscale("log")
     axes.set_xlabel("milliseconds from scene to image (capture included)")

@@ -56,7 +56,7 @@ const choose = () => {
   const first = (test) => names.find(test) ?? names[0];
   const before = [left.value, right.value];
   fill(left, names, names.includes(before[0]) ? before[0] : first((name) => name.startsWith("layered")));
-  fill(right, names, names.includes(before[1]) ? before[1] : first((name) => name.startsWith("reference")));
+  fill(right, names, names.includes(before[1]) ? before[1] : first((name) => name === "reference, gaussian lens"));
   show();
 };
 if (Object.keys(images).length) {
