@@ -81,6 +81,12 @@ LADDERS: dict[str, tuple[Rung, ...]] = {
         Rung("64 rays, jitter", {"jitter": True}),
         Rung("64 rays, no cones", {"cone": False}),
     ),
+    "lightfield": (
+        Rung("16 views", {"views": 16}),
+        Rung("default", quick=True, shown=True),
+        Rung("64 views", {"views": 64}),
+        Rung("1 peel", peels=1),
+    ),
 }
 
 
