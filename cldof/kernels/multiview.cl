@@ -38,6 +38,10 @@
 #define MULTIVIEW_STRIDE 1
 #endif
 #define MULTIVIEW_SPAN (16 * MULTIVIEW_STRIDE)
+/* 1: rays walk the peels themselves; there is no stack of layers but for the void. */
+#ifndef MULTIVIEW_PEELED
+#define MULTIVIEW_PEELED 0
+#endif
 
 typedef struct {
     int width, height, pitch, peels, layers, cells_x, cells_y;
@@ -328,9 +332,48 @@ static inline float16 edge_quad(const __global float *row, int x, int is_outside
     return (float16)(p[0], p[1], p[2], p[3]);
 }
 
+#if MULTIVIEW_PEELED
+/* One value of each pixel of a run; beyond the frame its edge goes on. */
+static inline float16 run_of(const __global float *row, int x, int is_inside, int width)
+{
+    if (is_inside && MULTIVIEW_STRIDE == 1) return load_quad(row + x);
+    float v[16];
+    for (int j = 0; j < 16; j++) v[j] = row[clamp_index(x + j * MULTIVIEW_STRIDE, width - 1)];
+    return *(const float16_unaligned *)v;
+}
+
+/* What multiview_split would have put into a layer for 16 pixels, straight from the peels. */
+static inline void peeled_quads(float16 quad[4], const __global float *color, const __global float *inv_depth,
+                                const __global float *extent, MultiviewSize size, float c1, float c0, float from,
+                                float to, int x, int row, int is_inside, int is_outside)
+{
+    for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
+    for (int m = 0; m < size.peels; m++) {
+        const size_t line = (size_t)m * size.height + row;
+        float16 end = run_of(extent + line * size.pitch, x, is_inside, size.width);
+        float16 near = run_of(inv_depth + line * size.pitch, x, is_inside, size.width) * c1 + c0;
+        float16 in = near < to && end >= from ? (float16)(1.0f) : (float16)(0.0f);
+        if (sum16(in) == 0.0f) continue;
+        float16 own = near >= from ? in : (float16)(0.0f);
+        const __global float *rgba = color + line * size.width * 4;
+        const float4 ins[4] = {in.s0123, in.s4567, in.s89ab, in.scdef};
+        const float4 owns[4] = {own.s0123, own.s4567, own.s89ab, own.scdef};
+        for (int q = 0; q < 4; q++) {
+            const int at = x + 4 * q * MULTIVIEW_STRIDE;
+            float16 v = is_inside ? layer_quad(rgba + at * 4) : edge_quad(rgba, at, is_outside, size.width);
+            float4 alpha = v.s37bf < 0.0f ? -v.s37bf : v.s37bf;
+            float4 weight = alpha >= MULTIVIEW_OPAQUE ? ins[q] : owns[q];
+            float4 covered = quad[q].s37bf < 0.0f ? -quad[q].s37bf : quad[q].s37bf;
+            quad[q] += v * spread((1.0f - covered) * weight);
+        }
+    }
+}
+#endif
+
 /* multiview_trace: all rays of 16 pixels, front to back through the layers of their cells.
  * source  sections 4.3 and 4.4: v1 * c1 + (1 - v1) * c2
  * reads   layers    float[layers (+ 1)][height][pitch][4]
+ *         color, inv_depth, extent, bounds  as multiview_split; with MULTIVIEW_PEELED only, then in place of layers
  *         lists     uint[cells_y][cells_x]
  *         sets      int[cells_y][cells_x]
  *         ray_sets  int2[sets * STRIDE^2]  first ray and number of rays
@@ -340,6 +383,11 @@ static inline float16 edge_quad(const __global float *row, int x, int is_outside
 __kernel void multiview_trace(__global float *restrict image, const __global float *restrict layers,
                               const __global uint *restrict lists, const __global int *restrict sets,
                               const __global int2 *restrict ray_sets, const __global int2 *restrict shifts,
+#if MULTIVIEW_PEELED
+                              const __global float *restrict color, const __global float *restrict inv_depth,
+                              const __global float *restrict extent, const __global float *restrict bounds, float c1,
+                              float c0,
+#endif
                               MultiviewSize size, int guard)
 {
     const int start = MULTIVIEW_SPAN * (int)get_global_id(0), y = (int)get_global_id(1) + guard;
@@ -374,15 +422,22 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
                 /* The void is at infinity, in the last layer. */
                 const int2 by = shift[s < size.layers ? s : s - 1];
                 const int x = x0 + by.x, row = y + by.y, inside = clamp_index(row, size.height - 1);
-                const __global float *from = layers + s * layer_floats + (size_t)inside * size.pitch * 4;
                 float16 c[4];
-                if (x >= 0 && x + MULTIVIEW_SPAN <= size.width && row == inside) {
+                const int is_inside = x >= 0 && x + MULTIVIEW_SPAN <= size.width && row == inside;
+#if MULTIVIEW_PEELED
+                if (s < size.layers) {
+                    peeled_quads(c, color, inv_depth, extent, size, c1, c0, bounds[s], bounds[s + 1], x, inside,
+                                 is_inside, row != inside);
+                } else
+#endif
+                {
+                    const int slot = MULTIVIEW_PEELED ? 0 : s;
+                    const __global float *from = layers + slot * layer_floats + (size_t)inside * size.pitch * 4;
 #pragma unroll
-                    for (int q = 0; q < 4; q++) c[q] = layer_quad(from + (x + 4 * q * MULTIVIEW_STRIDE) * 4);
-                } else {
-#pragma unroll
-                    for (int q = 0; q < 4; q++)
-                        c[q] = edge_quad(from, x + 4 * q * MULTIVIEW_STRIDE, row != inside, size.width);
+                    for (int q = 0; q < 4; q++) {
+                        const int at = x + 4 * q * MULTIVIEW_STRIDE;
+                        c[q] = is_inside ? layer_quad(from + at * 4) : edge_quad(from, at, row != inside, size.width);
+                    }
                 }
                 float16 rest = (float16)(0.0f);
 #if MULTIVIEW_VOID
