@@ -61,11 +61,8 @@ def about(method: str) -> str:
 
 
 def simulated_aperture(method: str) -> str | None:
-    """The one aperture that a method simulates; None for a method that takes the lens's own.
-
-    A method says so by a class attribute ``simulated_aperture``; without it the lens is Gaussian.
-    """
-    shape: str | None = getattr(_method(method), "simulated_aperture", "gaussian")
+    """The one aperture that a method simulates; None for a method that takes the lens's own."""
+    shape: str | None = _method(method).simulated_aperture
     return shape
 
 

@@ -88,6 +88,7 @@ class Method(Protocol):
     """
 
     name: str
+    simulated_aperture: str | None  # the one shape of lens that it simulates, or None: the lens's own
 
     def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
         """Decide what to compute, from numbers alone."""

@@ -46,6 +46,7 @@ class Gather:
     kernel: str = "disc"
 
     name = "gather"
+    simulated_aperture = "disc"
 
     def __post_init__(self) -> None:
         is_whole = isinstance(self.samples, int) and not isinstance(self.samples, bool)

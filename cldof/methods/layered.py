@@ -150,6 +150,7 @@ class Layered:
     engine: str = "auto"
 
     name = "layered"
+    simulated_aperture = "gaussian"
 
     def __post_init__(self) -> None:
         if self.layers is not None and not (isinstance(self.layers, int) and 3 <= self.layers <= MAX_LAYERS):

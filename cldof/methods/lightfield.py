@@ -124,6 +124,7 @@ class LightField:
     cull: bool = True
 
     name = "lightfield"
+    simulated_aperture = None
 
     def __post_init__(self) -> None:
         for name, low, high in (("views", 1, MAX_VIEWS), ("peels", 1, math.inf), ("seed", 0, math.inf)):

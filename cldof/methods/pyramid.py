@@ -127,6 +127,7 @@ class Pyramid:
     normalise: bool = True
 
     name = "pyramid"
+    simulated_aperture = "gaussian"
 
     def __post_init__(self) -> None:
         if self.sub_images is not None:
