@@ -150,6 +150,7 @@ class Multiview:
     seed: int = 0
 
     name = "multiview"
+    simulated_aperture = None
 
     def __post_init__(self) -> None:
         for name, low, high in (("rays", 1, MAX_RAYS), ("layers", _FEWEST_LAYERS, MAX_LAYERS), ("seed", 0, 2**31 - 1)):
