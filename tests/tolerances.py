@@ -41,6 +41,9 @@ TOLERANCES = {
     "multiview_extent": Tolerance(1e-5, 1e-5, outliers=1e-3),
     # float32 CoC against float64: a slot may fall into the next layer
     "multiview": Tolerance(2e-5, outliers=5e-3),
+    "lightfield_shrink": Tolerance(2e-6, outliers=1e-3),
+    # whole frames: a CoC that rounds to the other side moves a slot by 1/256 px, and now and then by a pixel
+    "lightfield": Tolerance(2e-5, 2e-5, outliers=5e-3),
 }
 
 

@@ -16,8 +16,8 @@
  *
  * A winner is two words per pixel, view and plane: the source slot (low) and the order of its inverse depth (high).
  * As one 64-bit number the smallest is the nearest slot and, of equally near ones, the first in memory. NONE is a hole.
- * Plane 0 holds slots that hide what is behind them; planes 1.. hold glass, by how much glass its column has in front
- * of it. */
+ * Plane 0 holds slots that hide what is behind them; planes 1.. hold glass, by how many panes its column has from it on
+ * backwards, so that a pane stays in its plane where another ends in front of it. */
 
 #include "common.clh"
 
@@ -175,13 +175,6 @@ static inline float16 coc16(float16 w, LightfieldLens lens)
 
 static inline float16 absolute16(float16 v) { return v < 0.0f ? -v : v; }
 
-static inline int all16(int16 v)
-{
-    const int8 a = v.lo & v.hi;
-    const int4 b = a.lo & a.hi;
-    return b.x & b.y & b.z & b.w;
-}
-
 /* lightfield_tiles: range of the inverse depth of each tile, and whether the first peel is one surface there.
  * reads   inv_depth  float[peels][height][pitch]     1/m
  *         color      float[peels][height][width][4]  alpha, with LIGHTFIELD_GLASS
@@ -194,7 +187,8 @@ __kernel void lightfield_tiles(__global float2 *restrict tiles, const __global f
     const int tx = get_global_id(0), line = get_global_id(1);
     if (tx >= size.tiles_x || line >= size.peels * size.tiles_y) return;
     const int m = line / size.tiles_y, x0 = tx * TILE, y0 = line % size.tiles_y * TILE;
-    const int x1 = x0 + TILE < size.width ? x0 + TILE : size.width, y1 = y0 + TILE < size.height ? y0 + TILE : size.height;
+    const int x1 = x0 + TILE < size.width ? x0 + TILE : size.width;
+    const int y1 = y0 + TILE < size.height ? y0 + TILE : size.height;
     const __global float *peel = inv_depth + (size_t)m * size.height * size.pitch;
     const float same = SAME_SURFACE_PX / (absolute(lens.c1) + 1e-30f);
     float low = MAXFLOAT, high = EMPTY;
@@ -216,7 +210,8 @@ __kernel void lightfield_tiles(__global float2 *restrict tiles, const __global f
 #endif
             }
         }
-    tiles[line * size.tiles_x + tx] = is_open ? (float2)(EMPTY) : high < 0.0f ? (float2)(0.0f, EMPTY) : (float2)(low, high);
+    low = high < 0.0f ? 0.0f : low;
+    tiles[line * size.tiles_x + tx] = is_open ? (float2)(EMPTY) : (float2)(low, high);
 }
 
 /* lightfield_cull: tiles that the first peel hides from all of the lens.
@@ -281,12 +276,11 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
     const __global uchar *open = tile_open + (m * size.tiles_y + y / TILE) * size.tiles_x;
     int count = 0;
     for (int x0 = 0; x0 < size.pitch; x0 += 16) {
-        int is_open = 0;
-        for (int t = x0 / TILE; t < x0 / TILE + 16 / TILE && t < size.tiles_x; t++) is_open |= open[t];
-        if (!is_open) continue; /* nor will any ray ask for these cells */
         const float16 w = depths_at(inv_depth, size, m, x0, y), c = coc16(w, lens);
-        const float16 below = depths_at(inv_depth, size, m, x0, y + 1), above = depths_at(inv_depth, size, m, x0, y - 1);
-        const float16 left = depths_left(inv_depth, size, m, x0, y, w), right = depths_right(inv_depth, size, m, x0, y, w);
+        const float16 above = depths_at(inv_depth, size, m, x0, y - 1);
+        const float16 below = depths_at(inv_depth, size, m, x0, y + 1);
+        const float16 left = depths_left(inv_depth, size, m, x0, y, w);
+        const float16 right = depths_right(inv_depth, size, m, x0, y, w);
         const float16 diagonal = depths_right(inv_depth, size, m, x0, y + 1, below);
         const float16 c_right = coc16(right, lens), c_below = coc16(below, lens);
         const float16 d_left = coc16(left, lens) - c, d_right = c_right - c;
@@ -297,6 +291,9 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
                               & (absolute16(d_right) <= similar) & (absolute16(d_below) <= similar)
                               & (absolute16(coc16(diagonal, lens) - c) <= similar);
         for (int i = 0; i < 16; i++) cells[row + x0 + i] = ((const int *)&is_cell)[i] ? 1 : 0;
+        int is_open = 0;
+        for (int t = x0 / TILE; t < x0 / TILE + 16 / TILE && t < size.tiles_x; t++) is_open |= open[t];
+        if (!is_open) continue;
         const int16 is_plain = is_here & (left >= 0.0f) & (right >= 0.0f) & (above >= 0.0f) & (below >= 0.0f)
                                & (absolute16(d_left) <= SAME_SURFACE_PX) & (absolute16(d_right) <= SAME_SURFACE_PX)
                                & (absolute16(d_above) <= SAME_SURFACE_PX) & (absolute16(d_below) <= SAME_SURFACE_PX);
@@ -325,7 +322,7 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
 #if LIGHTFIELD_GLASS
             int plane = 0;
             if (is_glass(color, size, m, x, y)) {
-                for (int k = 0; k <= m; k++) plane += is_glass(color, size, k, x, y);
+                for (int k = m; k < size.peels; k++) plane += is_glass(color, size, k, x, y);
                 plane = plane < size.planes ? plane : size.planes - 1;
             }
             slot_plane[to] = (uchar)plane;
@@ -361,8 +358,9 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
 
 /* Pixels of the view that slots cover: columns x0 to before x1, rows y0 to before y1. Rows and columns of a slope shear
  * against each other; the widest edge across covers what opens between them. INT is int or int16. */
-#define FOOTPRINT(INT, TO_INT, TO_FLOAT, column, line_y, coc, edge, v)                                                          \
-    const INT at_x = ((column) << 8) + TO_INT((coc) * (v).x) + (int)(v).z, at_y = ((line_y) << 8) + TO_INT((coc) * (v).y) + (int)(v).w;                   \
+#define FOOTPRINT(INT, TO_INT, TO_FLOAT, column, row_y, coc, edge, v)                                                 \
+    const INT at_x = ((column) << 8) + TO_INT((coc) * (v).x) + (int)(v).z;                                            \
+    const INT at_y = ((row_y) << 8) + TO_INT((coc) * (v).y) + (int)(v).w;                                             \
     const INT l = EDGE_BYTE(edge, 0), r = EDGE_BYTE(edge, 8), u = EDGE_BYTE(edge, 16), d = EDGE_BYTE(edge, 24);       \
     const float slope_x = 8.0f * (v).x, slope_y = 8.0f * (v).y;                                                       \
     const INT shear_x = TO_INT(TO_FLOAT(LARGER(KNOWN_EDGE(u), KNOWN_EDGE(d))) * absolute(slope_x));                   \
@@ -407,8 +405,8 @@ __kernel void lightfield_views(__global ulong *restrict winners, const __global 
             for (int b = 0; b < count; b += 16) {
                 const int16 at = load_ints(slot_at + row + b), edge = load_ints(slot_edge + row + b);
                 const float16 coc = load_quad(slot_coc + row + b);
-                FOOTPRINT(int16, convert_int16, convert_float16, at - (int)row - size.guard, (int16)(y - size.guard), coc,
-                          edge, v)
+                const int16 column = at - (int)row - size.guard;
+                FOOTPRINT(int16, convert_int16, convert_float16, column, (int16)(y - size.guard), coc, edge, v)
                 const int16 lefts = LARGER(x0, 0), rights = x1 < size.out_width ? x1 : size.out_width;
                 const int16 uppers = LARGER(y0, top), lowers = y1 < bottom ? y1 : bottom;
                 const int16 is_pixel = (rights - lefts == 1) & (lowers - uppers == 1);
@@ -438,14 +436,14 @@ __kernel void lightfield_views(__global ulong *restrict winners, const __global 
     }
 }
 
-/* The same in three steps for devices with many threads. `slot` and `view` say whose turn it is. */
+/* The same for devices with many threads: an item per slot and view, in its own launch whatever depends on all. */
 #define FOR_PIXELS_OF_SLOT                                                                                            \
     const int view = get_global_id(1), line = (int)get_global_id(0) / size.pitch;                                     \
     if (line >= size.peels * size.height) return;                                                                     \
     const int slot = (int)get_global_id(0) % size.pitch;                                                              \
     if (slot >= slot_count[line]) return;                                                                             \
     const size_t row = (size_t)line * size.pitch;                                                                     \
-    const LightfieldView v = views[first_view + view];                                                                        \
+    const LightfieldView v = views[first_view + view];                                                                \
     const uint at = slot_at[row + slot], key = slot_key[row + slot];                                                  \
     const int edges = (int)slot_edge[row + slot];                                                                     \
     const int plane = LIGHTFIELD_GLASS ? slot_plane[row + slot] : 0;                                                  \
@@ -655,7 +653,8 @@ __kernel void lightfield_shrink_again(__global float *mips, __global float *mip_
     const int x = get_global_id(0), line = get_global_id(1);
     if (x >= columns || line >= peels * rows) return;
     const size_t to = next + (size_t)line * columns + x, peel = first + (size_t)(line / rows) * width * height;
-    shrink(mips + to * 4, mip_depths + to, mips + peel * 4, mip_depths + peel, lens, x, line % rows, width, height, width);
+    shrink(mips + to * 4, mip_depths + to, mips + peel * 4, mip_depths + peel, lens, x, line % rows, width, height,
+           width);
 }
 
 /* Colour of a ray that no plain cell holds, or that is wide. */
@@ -763,9 +762,9 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
             float4 seen_through = (float4)(0.0f);
             for (int k = 0; k < count; k++) {
                 const float w = key_depth(hits[k].y), c = coc_of(w, lens);
+                const int ray_x = left + (i << 8) - (int)(c * shift_x), ray_y = top - (int)(c * shift_y);
                 seen_through += (1.0f - seen_through.w)
-                                * RAY_COLOR(color, inv_depth, size, lens, hits[k].x, left + (i << 8) - (int)(c * shift_x),
-                                            top - (int)(c * shift_y), w, c, seed + i);
+                                * RAY_COLOR(color, inv_depth, size, lens, hits[k].x, ray_x, ray_y, w, c, seed + i);
             }
             /* A hole behind glass counts as far as the glass covers it. */
             total[i] += weight * seen_through;
@@ -806,7 +805,8 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
 #if LIGHTFIELD_LEVELS
             is_plain &= absolute16(c) * lens.cell < 1.41421356f;
 #endif
-            const float16 fx = convert_float16(ray_x & 255) * (1.0f / SUB), fy = convert_float16(ray_y & 255) * (1.0f / SUB);
+            const float16 fx = convert_float16(ray_x & 255) * (1.0f / SUB);
+            const float16 fy = convert_float16(ray_y & 255) * (1.0f / SUB);
             const int end = n - b < 16 ? n - b : 16;
             for (int i = 0; i < end; i++) {
                 const uint winner = ((const uint *)&at)[i];

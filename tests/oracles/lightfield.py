@@ -1,0 +1,236 @@
+"""The light-field method in whole numbers and float64, from Yu, Wang & Yu 2010 and docs/methods/lightfield.md.
+
+Positions are whole 1/256 px, made from one float32 product each, as kernels/lightfield.cl has it: what covers which
+pixel is then the same to the last bit. Everything else is in float64.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+NONE = 0xFFFFFFFF
+UNKNOWN = -128  # edge to a neighbour of another surface
+SAME_SURFACE, STEEP, STRAIGHT = 1.0, 7.5, 0.25
+OPAQUE = np.float32(0.999)
+
+
+class Slots(NamedTuple):
+    """All slots to warp, in the order of memory; one entry each."""
+
+    at: np.ndarray  # (peel * height + y) * pitch + x
+    x: np.ndarray
+    y: np.ndarray
+    key: np.ndarray  # uint32, smaller is nearer
+    coc: np.ndarray  # float32, 1/256 px
+    edges: np.ndarray  # (N, 4) left, right, above, below, in 1/16 px
+    plane: np.ndarray
+
+
+def coc(inv_depth: np.ndarray, c1: float, c0: float) -> np.ndarray:
+    """float32, rounded once."""
+    return (np.float64(np.float32(c1)) * inv_depth + np.float64(np.float32(c0))).astype(np.float32)
+
+
+def depth_key(inv_depth: np.ndarray) -> np.ndarray:
+    bits = np.ascontiguousarray(inv_depth, np.float32).view(np.uint32)
+    return np.where(bits >> 31 != 0, bits, ~(bits | np.uint32(0x80000000)))
+
+
+def edges(inv_depth: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """CoC to the four neighbours in 1/16 px, :data:`UNKNOWN` where the surface ends; (M, H, W, 4) of whole numbers."""
+    peels, height, width = inv_depth.shape
+    result = np.full((peels, height, width, 4), UNKNOWN)
+
+    def at(m: int, y: int, x: int) -> float | None:
+        if 0 <= m < peels and 0 <= y < height and 0 <= x < width and inv_depth[m, y, x] >= 0:
+            return float(c[m, y, x])
+        return None
+
+    for m, y, x in np.ndindex(peels, height, width):
+        own = at(m, y, x)
+        if own is None:
+            continue
+        for side, (dx, dy) in enumerate(((-1, 0), (1, 0), (0, -1), (0, 1))):
+            there = [at(k, y + dy, x + dx) for k in (m, m - 1, m + 1)]
+            steps = [float(np.float32(np.float32(one) - np.float32(own))) for one in there if one is not None]
+            near = [d for d in steps if abs(d) <= SAME_SURFACE]
+            if near:
+                d = near[0]
+            elif there[0] is None or abs(steps[0]) > STEEP:
+                continue
+            else:
+                d = steps[0]
+                beyond, behind = at(m, y + 2 * dy, x + 2 * dx), at(m, y - dy, x - dx)
+                straight = beyond is not None and abs(beyond - own - 2 * d) <= STRAIGHT * abs(d)
+                straight |= behind is not None and abs(behind - own + d) <= STRAIGHT * abs(d)
+                if not straight:
+                    continue
+            result[m, y, x, side] = int(d * 16 + (-0.5 if d < 0 else 0.5))
+    return result
+
+
+def slots(
+    inv_depth: np.ndarray, alpha: np.ndarray, pitch: int, c1: float, c0: float, planes: int, support: str
+) -> Slots:
+    """List the slots of layers (M, H, W), where -1 is an empty slot."""
+    height = inv_depth.shape[1]
+    c = coc(inv_depth, c1, c0)
+    all_edges = edges(inv_depth, c) if support == "surface" else np.zeros((*c.shape, 4), int)
+    m, y, x = np.nonzero(inv_depth >= 0)
+    again = (m > 0) & (inv_depth[m, y, x] == 0) & (inv_depth[m - 1, y, x] == 0)
+    m, y, x = m[~again], y[~again], x[~again]
+    glass = (alpha > 0) & (alpha < OPAQUE)
+    rank = np.minimum(np.cumsum(glass[::-1], axis=0)[::-1], planes - 1)
+    plane = np.where(glass & (planes > 1), rank, 0)
+    return Slots(
+        (m * height + y) * pitch + x,
+        x,
+        y,
+        depth_key(inv_depth)[m, y, x],
+        c[m, y, x] * np.float32(256),
+        all_edges[m, y, x],
+        plane[m, y, x],
+    )
+
+
+def _product(a: np.ndarray, b: float) -> np.ndarray:
+    return (a.astype(np.float32) * np.float32(b)).astype(np.int64)
+
+
+def _span(position: np.ndarray, low: np.ndarray, high: np.ndarray, support: str) -> tuple[np.ndarray, np.ndarray]:
+    if support == "none":
+        first = (position + 128) >> 8
+        return first, first + 1
+    if support == "2x2":
+        return position >> 8, (position + 511) >> 8
+    if support == "3x3":
+        first = (position - 128) >> 8
+        return first, first + 3
+    return (position + 127 - low) >> 8, (position + 383 + high) >> 8
+
+
+def footprints(some: Slots, view: np.ndarray, guard: int, support: str) -> tuple[np.ndarray, ...]:
+    """Columns x0 to before x1 and rows y0 to before y1 of every slot in a view (vx, vy, place x, place y)."""
+    spans = []
+    for axis, place in ((0, some.x), (1, some.y)):
+        v = float(view[axis])
+        position = 256 * (place - guard) + _product(some.coc, v) + int(view[2 + axis])
+        own, across = some.edges[:, 2 * axis : 2 * axis + 2], some.edges[:, 2 - 2 * axis : 4 - 2 * axis]
+        widest = np.where(across == UNKNOWN, 0, np.abs(across)).max(axis=1)
+        shear = _product(widest, abs(np.float32(8) * np.float32(v)))
+        moved = _product(own, np.float32(8) * np.float32(v))
+        low = np.where(own[:, 0] == UNKNOWN, 0, -moved[:, 0] + shear + 8)
+        high = np.where(own[:, 1] == UNKNOWN, 0, moved[:, 1] + shear + 8)
+        spans += _span(position, low, high, support)
+    return tuple(spans)
+
+
+def warp(some: Slots, view: np.ndarray, size: tuple[int, int], planes: int, guard: int, support: str) -> np.ndarray:
+    """Winners of one view, (planes, height, width) of uint64: order of depth above, source below."""
+    height, width = size
+    winners = np.full((planes, height, width), np.uint64(0xFFFFFFFFFFFFFFFF))
+    x0, x1, y0, y1 = footprints(some, view, guard, support)
+    value = some.key.astype(np.uint64) << np.uint64(32) | some.at.astype(np.uint64)
+    for dy in range(max(0, int((y1 - y0).max(initial=0)))):
+        for dx in range(max(0, int((x1 - x0).max(initial=0)))):
+            x, y = x0 + dx, y0 + dy
+            hit = (x < x1) & (y < y1) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            np.minimum.at(winners, (some.plane[hit], y[hit], x[hit]), value[hit])
+    return winners
+
+
+def _look_up(
+    color: np.ndarray, inv_depth: np.ndarray, winner: np.ndarray, view: np.ndarray, c1: float, c0: float,
+    pitch: int, guard: int, lookup: str, glass: bool,
+) -> np.ndarray:  # fmt: skip
+    """Colours of the rays of a view, (H, W, 4)."""
+    rows, columns = inv_depth.shape[1:]
+    height, width = winner.shape
+    source = (winner & np.uint64(NONE)).astype(np.int64)
+    line, x = source // pitch, source % pitch
+    m, y = line // rows, line % rows
+    hole = source == NONE
+    m, y, x = (np.where(hole, 0, n) for n in (m, y, x))
+    base = color[m, y, x]
+    if lookup == "winner":
+        return base
+    w = inv_depth[m, y, x]
+    c = coc(w, c1, c0)
+    gy, gx = np.mgrid[:height, :width]
+    ray_x = 256 * (gx + guard) - _product(c, np.float32(256) * view[0])
+    ray_y = 256 * (gy + guard) - _product(c, np.float32(256) * view[1])
+    step_x, step_y = np.where(ray_x < 256 * x, -1, 1), np.where(ray_y < 256 * y, -1, 1)
+    fx = np.minimum(np.abs(ray_x - 256 * x), 256)[..., None] / 256
+    fy = np.minimum(np.abs(ray_y - 256 * y), 256)[..., None] / 256
+
+    def tap(dx: np.ndarray, dy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        u, v = x + dx, y + dy
+        inside = (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+        u, v = np.clip(u, 0, columns - 1), np.clip(v, 0, rows - 1)
+        other, found = inv_depth[m, v, u], color[m, v, u]
+        close = np.abs(other - w) * abs(c1) <= 0.5 + 0.125 * np.abs(c)
+        kind = (found[..., 3] >= OPAQUE) == (base[..., 3] >= OPAQUE)
+        return inside & (other >= 0) & close, kind | (not glass), found
+
+    zero = np.zeros_like(step_x)
+    has_x, kind_x, beside = tap(step_x, zero)
+    has_y, kind_y, below = tap(zero, step_y)
+    has_both, _, far = tap(step_x, step_y)
+    beside = np.where((has_x & kind_x)[..., None], beside, base)
+    below = np.where((has_y & kind_y)[..., None], below, base)
+    far = np.where(has_both[..., None], far, np.where(has_y[..., None], below, beside))
+    if glass:
+        far = np.where(((far[..., 3] >= OPAQUE) == (base[..., 3] >= OPAQUE))[..., None], far, base)
+    one, two = base + fx * (beside - base), below + fx * (far - below)
+    return one + fy * (two - one)
+
+
+def render(
+    color: np.ndarray, inv_depth: np.ndarray, views: np.ndarray, c1: float, c0: float, *, pitch: int, guard: int,
+    glass: bool, support: str = "surface", lookup: str = "bilinear", cos4: float = 0.0,
+) -> np.ndarray:  # fmt: skip
+    """A whole frame without mip levels; layers (M, H, W, 4) and (M, H, W) with -1 where nothing is."""
+    planes = 3 if glass else 1
+    size = (color.shape[1] - 2 * guard, color.shape[2] - 2 * guard)
+    color = color.astype(np.float64)
+    some = slots(inv_depth, color[..., 3].astype(np.float32), pitch, c1, c0, planes, support)
+    total, seen = np.zeros((*size, 4)), np.zeros(size)
+    for view in views:
+        weight = 1.0 / (1.0 + cos4 * (float(view[0]) ** 2 + float(view[1]) ** 2)) ** 2
+        winners = warp(some, view, size, planes, guard, support)
+        solid = winners[0]
+        image = np.zeros((*size, 4))
+        for winner in np.sort(winners[1:], axis=0):
+            there = (winner & np.uint64(NONE) != NONE) & (winner < solid)
+            found = _look_up(color, inv_depth, winner, view, c1, c0, pitch, guard, lookup, glass)
+            image += np.where(there[..., None], (1.0 - image[..., 3:]) * found, 0.0)
+        there = solid & np.uint64(NONE) != NONE
+        found = _look_up(color, inv_depth, solid, view, c1, c0, pitch, guard, lookup, glass)
+        image += np.where(there[..., None], (1.0 - image[..., 3:]) * found, 0.0)
+        total += weight * image
+        seen += weight * np.where(there, 1.0, image[..., 3])
+    inner = color[:, guard : guard + size[0], guard : guard + size[1]]
+    pinhole = np.zeros((*size, 4))
+    for layer in inner:
+        pinhole += (1.0 - pinhole[..., 3:]) * layer
+    known = seen > 1e-4
+    result = np.where(known[..., None], total / np.where(known, seen, 1.0)[..., None], pinhole)
+    result[..., 3] = np.minimum(result[..., 3], 1.0)
+    return result
+
+
+def shrink(color: np.ndarray, inv_depth: np.ndarray, c1: float, c0: float) -> tuple[np.ndarray, np.ndarray]:
+    """One level of the pyramid of one peel, (H, W, 4) and (H, W): a 3x3 Gaussian over the middle pixel's surface."""
+    height, width = inv_depth.shape
+    y, x = np.mgrid[: (height + 1) // 2, : (width + 1) // 2] * 2
+    w = inv_depth[y, x]
+    limit = 0.5 + 0.125 * np.abs(c1 * w + c0)
+    total, weights = np.zeros((*w.shape, 4)), np.zeros(w.shape)
+    for j in (-1, 0, 1):
+        for i in (-1, 0, 1):
+            v, u = np.clip(y + j, 0, height - 1), np.clip(x + i, 0, width - 1)
+            close = (inv_depth[v, u] >= 0) & (abs(c1) * np.abs(inv_depth[v, u] - w) <= limit)
+            weight = np.where(close, (0.25 if i else 0.5) * (0.25 if j else 0.5), 0.0)
+            total += weight[..., None] * color[v, u]
+            weights += weight
+    return np.where(weights[..., None] > 0, total / np.maximum(weights, 1e-30)[..., None], 0.0), w
