@@ -22,7 +22,7 @@
 #define MULTIVIEW_CLOSED 1e-3f
 /* Steps in px from one pixel to the next that belong to one surface. */
 #define MULTIVIEW_CONNECTED 2.0f
-/* Below this share of rays that met something known, a pixel is exactly 0. */
+/* Below this share of rays that met something known, a pixel is what a pinhole sees. */
 #define MULTIVIEW_LEAST 1e-4f
 /* Pixels that a cone may reach to either side, a multiple of 4, and pixels of a row that an item of the filter makes. */
 #define MULTIVIEW_HALO 16
@@ -336,7 +336,9 @@ static inline float16 edge_quad(const __global float *row, int x, int is_outside
 /* One value of each pixel of a run; beyond the frame its edge goes on. */
 static inline float16 run_of(const __global float *row, int x, int is_inside, int width)
 {
-    if (is_inside && MULTIVIEW_STRIDE == 1) return load_quad(row + x);
+#if MULTIVIEW_STRIDE == 1
+    if (is_inside) return load_quad(row + x);
+#endif
     float v[16];
     for (int j = 0; j < 16; j++) v[j] = row[clamp_index(x + j * MULTIVIEW_STRIDE, width - 1)];
     return *(const float16_unaligned *)v;
@@ -370,10 +372,22 @@ static inline void peeled_quads(float16 quad[4], const __global float *color, co
 }
 #endif
 
+/* What a lens of radius 0 sees: where every ray of a pixel is lost. */
+static inline float4 pinhole(const __global float *color, MultiviewSize size, int x, int y)
+{
+    float4 v = (float4)(0.0f);
+    for (int m = size.peels - 1; m >= 0; m--) {
+        float4 front = load_pixel(color + (((size_t)m * size.height + y) * size.width + x) * 4);
+        v = front + (1.0f - front.w) * v;
+    }
+    return v;
+}
+
 /* multiview_trace: all rays of 16 pixels, front to back through the layers of their cells.
  * source  sections 4.3 and 4.4: v1 * c1 + (1 - v1) * c2
  * reads   layers    float[layers (+ 1)][height][pitch][4]
- *         color, inv_depth, extent, bounds  as multiview_split; with MULTIVIEW_PEELED only, then in place of layers
+ *         color     float[peels][height][width][4]
+ *         inv_depth, extent, bounds  as multiview_split has them; with MULTIVIEW_PEELED only, in place of layers
  *         lists     uint[cells_y][cells_x]
  *         sets      int[cells_y][cells_x]
  *         ray_sets  int2[sets * STRIDE^2]  first ray and number of rays
@@ -383,10 +397,10 @@ static inline void peeled_quads(float16 quad[4], const __global float *color, co
 __kernel void multiview_trace(__global float *restrict image, const __global float *restrict layers,
                               const __global uint *restrict lists, const __global int *restrict sets,
                               const __global int2 *restrict ray_sets, const __global int2 *restrict shifts,
+                              const __global float *restrict color,
 #if MULTIVIEW_PEELED
-                              const __global float *restrict color, const __global float *restrict inv_depth,
-                              const __global float *restrict extent, const __global float *restrict bounds, float c1,
-                              float c0,
+                              const __global float *restrict inv_depth, const __global float *restrict extent,
+                              const __global float *restrict bounds, float c1, float c0,
 #endif
                               MultiviewSize size, int guard)
 {
@@ -471,12 +485,17 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
 #if MULTIVIEW_VOID
                 known += clear[j];
 #endif
-                float4 v = known > MULTIVIEW_LEAST * (float)rays.y ? p[j] / known : (float4)(0.0f);
+                float4 v;
+                if (known > MULTIVIEW_LEAST * (float)rays.y) {
+                    v = p[j] / known;
 #if MULTIVIEW_VOID
-                v.w = v.w > 1.0f ? 1.0f : v.w;
+                    v.w = v.w > 1.0f ? 1.0f : v.w;
 #else
-                v.w = known > MULTIVIEW_LEAST * (float)rays.y ? 1.0f : 0.0f;
+                    v.w = 1.0f;
 #endif
+                } else {
+                    v = pinhole(color, size, x, y);
+                }
                 store_pixel(out + (x - guard) * 4, v);
             }
         }

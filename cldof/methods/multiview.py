@@ -3,7 +3,7 @@
 The peels are split into layers of equal growth of the signed circle of confusion (eq. 4). Each pixel sends one ray per
 lens sample, which meets the layers front to back and is thickened to a cone as wide as the samples are apart
 (section 4.4). Rays that meet what lies outside of the frame, or what no peel holds, are dropped and the rest
-renormalised. The aperture may have any shape.
+renormalised; a pixel that has lost them all shows what a pinhole sees. The aperture may have any shape.
 
 Where this differs from the paper, docs/methods/multiview.md has the measurements:
 
@@ -404,7 +404,7 @@ class _Builder:
         peels: tuple[Any, ...] = ()
         if self.peeled:
             self._constant("bounds", self.layers.bounds)
-            peels = (*(read(name) for name in ("color", "inv_depth", "extent", "bounds")), *self.lens)
+            peels = (*(read(name) for name in ("inv_depth", "extent", "bounds")), *self.lens)
         self._add(
             "multiview_trace",
             (
@@ -415,6 +415,7 @@ class _Builder:
                 read("sets"),
                 read("ray_sets"),
                 read("shifts"),
+                read("color"),
                 *peels,
                 self.size,
                 np.int32(self.shape.guard_px),

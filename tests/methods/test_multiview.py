@@ -314,9 +314,7 @@ def test_random_frames_keep_the_promises(
     assert out.max() <= 1.0 + 1e-4
     assert (out[..., 3] <= 1.0).all()
     if opaque:
-        assert np.isin(out[..., 3], (0.0, 1.0)).all()
-        # No ray of a pixel may meet anything known, if the frame is smaller than the blur.
-        assert (out[..., 3] == 1.0).all() or min(width, height) < 2.5 * aperture_px
+        np.testing.assert_allclose(out[..., 3], 1.0, atol=1e-6)
 
 
 def test_adaptive_rays_change_little(device: Device) -> None:

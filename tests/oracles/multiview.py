@@ -65,7 +65,14 @@ def past(color: np.ndarray) -> np.ndarray:
     return ((through > 1e-3) | (color[-1, ..., 3] == 0.0)).astype(float)
 
 
-def trace(layers: np.ndarray, shifts: np.ndarray, void: np.ndarray | None = None) -> np.ndarray:
+def pinhole(color: np.ndarray) -> np.ndarray:
+    image = np.zeros(color.shape[1:])
+    for layer in color[::-1]:
+        image = layer + (1.0 - layer[..., 3:]) * image
+    return image
+
+
+def trace(layers: np.ndarray, shifts: np.ndarray, color: np.ndarray, void: np.ndarray | None = None) -> np.ndarray:
     """All rays of all pixels.
 
     Parameters
@@ -73,6 +80,8 @@ def trace(layers: np.ndarray, shifts: np.ndarray, void: np.ndarray | None = None
     layers : (K, H, W, 4)
     shifts : (rays, K, 2)
         Right and down, in px.
+    color : (M, H, W, 4)
+        The peels: what pixels without rays show.
     void : (H, W), optional
         For frames that are not opaque.
 
@@ -95,10 +104,10 @@ def trace(layers: np.ndarray, shifts: np.ndarray, void: np.ndarray | None = None
             known += np.where(inside, left * void[at_y, at_x], 0.0)
     known += total[..., 3]
     enough = known > 1e-4 * len(shifts)
-    result = np.where(enough[..., None], total / np.where(enough, known, 1.0)[..., None], 0.0)
+    result = total / np.where(enough, known, 1.0)[..., None]
     if void is None:
-        result[..., 3] = enough
-    return result
+        result[..., 3] = 1.0
+    return np.where(enough[..., None], result, pinhole(color))
 
 
 def render(
@@ -118,7 +127,7 @@ def render(
     columns = slots(inverse_depth, c1, c0)
     layers = split(color, columns, bounds)
     layers = np.stack([cone(one, *window) if window else one for one, window in zip(layers, windows, strict=True)])
-    image = trace(layers, shifts, None if opaque else past(color))
+    image = trace(layers, shifts, color, None if opaque else past(color))
     inner = slice(guard, -guard or None)
     return image[inner, inner]
 
