@@ -114,12 +114,12 @@ static inline float edge_of(const __global float *inv_depth, LightfieldSize size
         if (absolute(d) <= SAME_SURFACE_PX) return d;
     }
     /* Beside a silhouette in front of it a surface goes on in another peel. */
-    for (int other = m - 1; other <= m + 1; other += 2) {
-        if (other < 0 || other >= size.peels) continue;
-        float v = there[other * plane];
-        float e = coc_of(v, lens) - c;
-        if (v >= 0.0f && absolute(e) <= SAME_SURFACE_PX) return e;
+    float best = MAXFLOAT;
+    for (int other = 0; other < size.peels; other++) {
+        const float v = there[other * plane], e = coc_of(v, lens) - c;
+        best = other != m && v >= 0.0f && absolute(e) < absolute(best) ? e : best;
     }
+    if (absolute(best) <= SAME_SURFACE_PX) return best;
     if (absolute(d) > STEEP_PX) return MAXFLOAT;
     const int ax = nx + dx, ay = ny + dy, bx = x - dx, by = y - dy;
     if (ax >= 0 && ax < size.width && ay >= 0 && ay < size.height) {

@@ -51,15 +51,16 @@ def edges(inv_depth: np.ndarray, c: np.ndarray) -> np.ndarray:
         if own is None:
             continue
         for side, (dx, dy) in enumerate(((-1, 0), (1, 0), (0, -1), (0, 1))):
-            there = [at(k, y + dy, x + dx) for k in (m, m - 1, m + 1)]
-            steps = [float(np.float32(np.float32(one) - np.float32(own))) for one in there if one is not None]
-            near = [d for d in steps if abs(d) <= SAME_SURFACE]
-            if near:
-                d = near[0]
-            elif there[0] is None or abs(steps[0]) > STEEP:
+            there = [at(k, y + dy, x + dx) for k in range(peels)]
+            steps = [None if one is None else float(np.float32(np.float32(one) - np.float32(own))) for one in there]
+            d, elsewhere = steps[m], [one for k, one in enumerate(steps) if k != m and one is not None]
+            if d is not None and abs(d) <= SAME_SURFACE:
+                pass
+            elif elsewhere and abs(min(elsewhere, key=abs)) <= SAME_SURFACE:
+                d = min(elsewhere, key=abs)
+            elif d is None or abs(d) > STEEP:
                 continue
             else:
-                d = steps[0]
                 beyond, behind = at(m, y + 2 * dy, x + 2 * dx), at(m, y - dy, x - dx)
                 straight = beyond is not None and abs(beyond - own - 2 * d) <= STRAIGHT * abs(d)
                 straight |= behind is not None and abs(behind - own + d) <= STRAIGHT * abs(d)
