@@ -4,11 +4,14 @@ from typing import Any
 
 import numpy as np
 
+from cldof import LayeredFrame, Lens
 from cldof.host.device import Device
 from cldof.host.passes import Access, Buffer, FrameProgram, Mode, Pass, Role, read, write
 from cldof.host.scheduler import compile
+from cldof.methods import FrameShape, Method
+from cldof.renderer import _inverse_depth_program
 
-__all__ = ["padded", "run_pass", "run_program"]
+__all__ = ["inverse_depth", "padded", "render_frame", "run_pass", "run_program"]
 
 
 def run_program(
@@ -65,3 +68,20 @@ def padded(image: np.ndarray, pitch: int, fill: float = np.nan) -> np.ndarray:
     result = np.full((*image.shape[:1], pitch, *image.shape[2:]), fill, np.float32)
     result[:, : image.shape[1]] = image
     return result
+
+
+def inverse_depth(device: Device, frame: LayeredFrame) -> np.ndarray:
+    """What the renderer derives from a frame once; (layers, height, pitch)."""
+    shape = FrameShape.of(frame)
+    inputs = {"color": frame.color, "depth": frame.depth}
+    size = (shape.layers, shape.height, shape.pitch)
+    return run_program(device, _inverse_depth_program(shape), inputs, {}, "inv_depth", size)
+
+
+def render_frame(device: Device, method: Method, frame: LayeredFrame, lens: Lens) -> np.ndarray:
+    """A whole frame by a method, on a device whose buffers are checked."""
+    shape = FrameShape.of(frame)
+    plan = method.plan(frame, lens)
+    program = method.program(shape, plan, device.traits)
+    inputs = {"color": frame.color, "inv_depth": inverse_depth(device, frame)}
+    return run_program(device, program, inputs, dict(plan.params), "image", (*shape.output_size, 4))

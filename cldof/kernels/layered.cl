@@ -71,24 +71,6 @@ typedef struct {
     int segment;     /* pixels of a row a work-group owns, a multiple of LAYERED_TILE */
 } LayeredStep;
 
-static inline float16 clamp01(float16 v)
-{
-    v = v < 0.0f ? (float16)(0.0f) : v;
-    return v > 1.0f ? (float16)(1.0f) : v;
-}
-
-static inline float sum16(float16 v)
-{
-    float8 a = v.lo + v.hi;
-    float4 b = a.lo + a.hi;
-    return (b.x + b.y) + (b.z + b.w);
-}
-
-static inline float16 over(float16 front, float16 back)
-{
-    return front + (1.0f - front.s33337777bbbbffff) * back;
-}
-
 static inline LayeredLayer layered_layer(const LayeredMatting *matting, int k)
 {
     LayeredLayer layer = {matting->layer[k], k > 0 ? matting->layer[k - 1] : (float4)(0.0f), matting->reach[k],

@@ -47,13 +47,6 @@ typedef struct {
     int width, height, pitch, peels, layers, cells_x, cells_y;
 } MultiviewSize;
 
-static inline float sum16(float16 v)
-{
-    float8 a = v.lo + v.hi;
-    float4 b = a.lo + a.hi;
-    return (b.x + b.y) + (b.z + b.w);
-}
-
 static inline float16 coc_of(float16 w, float c1, float c0)
 {
     float16 c = w * c1 + c0;

@@ -66,19 +66,6 @@ typedef float8 __attribute__((aligned(4))) float8_unaligned;
 static inline float8 load_eight(const __global float *p) { return *(const __global float8_unaligned *)p; }
 static inline void store_four(__global float *p, float4 v) { *(__global float4_unaligned *)p = v; }
 
-static inline float16 clamp01(float16 v)
-{
-    v = v < 0.0f ? (float16)(0.0f) : v;
-    return v > 1.0f ? (float16)(1.0f) : v;
-}
-
-static inline float sum16(float16 v)
-{
-    float8 a = v.lo + v.hi;
-    float4 b = a.lo + a.hi;
-    return (b.x + b.y) + (b.z + b.w);
-}
-
 static inline float sum4(float4 v) { return (v.x + v.y) + (v.z + v.w); }
 
 /* How many of 16 pixels are holes. */

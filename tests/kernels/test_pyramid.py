@@ -13,10 +13,9 @@ from cldof.host.device import Device
 from cldof.host.passes import FrameProgram, Param, Role
 from cldof.methods import FrameShape
 from cldof.methods.pyramid import Pyramid, blur_radius
-from cldof.renderer import _inverse_depth_program
 from tests.frames import noise_frame
 from tests.oracles import pyramid as oracle
-from tests.running import run_program
+from tests.running import inverse_depth, run_program
 from tests.tolerances import assert_close
 
 SIZES = [(1, 1), (1, 29), (31, 1), (37, 21), (97, 61), (64, 48)]
@@ -56,14 +55,7 @@ def cut(device: Device, frame: LayeredFrame, coc_px: float, after: str, outputs:
     program = method.program(shape, plan, device.traits)
     first_run = [step for step in program.passes if not any("alpha_" in str(argument) for argument in step.args)]
     end = max(number for number, step in enumerate(first_run) if step.kernel == after) + 1
-    inv_depth = run_program(
-        device,
-        _inverse_depth_program(shape),
-        {"color": frame.color, "depth": frame.depth},
-        {},
-        "inv_depth",
-        (shape.layers, shape.height, shape.pitch),
-    )
+    inv_depth = inverse_depth(device, frame)
     results = {}
     for name in outputs:
         buffers = [

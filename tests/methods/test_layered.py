@@ -10,30 +10,16 @@ from hypothesis import strategies as st
 from cldof import Camera, InputError, LayeredFrame, Lens
 from cldof.host.device import Device
 from cldof.lens import GAUSSIAN_SIGMA
-from cldof.methods import FrameShape, gaussian
+from cldof.methods import gaussian
 from cldof.methods.layered import MAX_LAYERS, Layered, LayerStack, layer_coc, matting_functions
-from cldof.renderer import _inverse_depth_program
 from tests.frames import noise_frame, plane_frame
 from tests.oracles import layered as oracle
-from tests.running import run_program
+from tests.running import render_frame
 from tests.tolerances import assert_close
 
 
 def render(device: Device, frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:
-    method = Layered(**options)
-    shape = FrameShape.of(frame)
-    inv_depth = run_program(
-        device,
-        _inverse_depth_program(shape),
-        {"color": frame.color, "depth": frame.depth},
-        {},
-        "inv_depth",
-        (shape.layers, shape.height, shape.pitch),
-    )
-    plan = method.plan(frame, lens)
-    program = method.program(shape, plan, device.traits)
-    inputs = {"color": frame.color, "inv_depth": inv_depth}
-    return run_program(device, program, inputs, dict(plan.params), "image", (*shape.output_size, 4))
+    return render_frame(device, Layered(**options), frame, lens)
 
 
 def twin(frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:

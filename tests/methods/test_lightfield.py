@@ -12,30 +12,16 @@ from cldof.host.device import Device
 from cldof.lens import DiscAperture, PolygonAperture
 from cldof.methods import FrameShape
 from cldof.methods.lightfield import LightField, Views, _radical_inverse, lens_views
-from cldof.renderer import _inverse_depth_program
 from tests.frames import noise_frame, plane_frame
 from tests.oracles import lightfield as oracle
-from tests.running import run_program
+from tests.running import render_frame
 from tests.tolerances import assert_close
 
 PAPER = {"peels": 1, "support": "2x2", "lookup": "winner", "dither": False, "pattern": "halton"}
 
 
 def render(device: Device, frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:
-    method = LightField(**options)
-    shape = FrameShape.of(frame)
-    inv_depth = run_program(
-        device,
-        _inverse_depth_program(shape),
-        {"color": frame.color, "depth": frame.depth},
-        {},
-        "inv_depth",
-        (shape.layers, shape.height, shape.pitch),
-    )
-    plan = method.plan(frame, lens)
-    program = method.program(shape, plan, device.traits)
-    inputs = {"color": frame.color, "inv_depth": inv_depth}
-    return run_program(device, program, inputs, dict(plan.params), "image", (*shape.output_size, 4))
+    return render_frame(device, LightField(**options), frame, lens)
 
 
 def lens_for(frame: LayeredFrame, coc_px: float, focus_m: float = 2.0, **more) -> Lens:

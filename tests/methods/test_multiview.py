@@ -14,18 +14,10 @@ from cldof.host.passes import FrameProgram
 from cldof.lens import GaussianAperture, PolygonAperture
 from cldof.methods import FrameShape
 from cldof.methods.multiview import MAX_LAYERS, Multiview, cones, ray_sets
-from cldof.renderer import _inverse_depth_program
 from tests.frames import noise_frame, plane_frame
 from tests.oracles import multiview as oracle
-from tests.running import run_program
+from tests.running import inverse_depth, run_program
 from tests.tolerances import assert_close
-
-
-def inverse_depth(device: Device, frame: LayeredFrame) -> np.ndarray:
-    shape = FrameShape.of(frame)
-    inputs = {"color": frame.color, "depth": frame.depth}
-    size = (shape.layers, shape.height, shape.pitch)
-    return run_program(device, _inverse_depth_program(shape), inputs, {}, "inv_depth", size)
 
 
 def render(device: Device, frame: LayeredFrame, lens: Lens, one_ray: np.ndarray | None = None, **options) -> np.ndarray:

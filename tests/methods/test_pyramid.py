@@ -9,33 +9,19 @@ from hypothesis import strategies as st
 
 from cldof import Camera, InputError, LayeredFrame, Lens
 from cldof.host.device import Device
-from cldof.methods import FrameShape
 from cldof.methods.pyramid import MAX_STEPS, Pyramid, SubImages, blur_radius
-from cldof.renderer import _inverse_depth_program
+from cldof.metrics import psnr
 from tests.frames import noise_frame, plane_frame
-from tests.opengl import require_opengl
 from tests.oracles import pyramid as oracle
-from tests.running import run_program
+from tests.references import judged
+from tests.running import render_frame
 from tests.tolerances import assert_close
 
 PAPER = {"matting": "paper", "radius": "paper", "hidden": "interpolated", "normalise": False}
 
 
 def render(device: Device, frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:
-    method = Pyramid(**options)
-    shape = FrameShape.of(frame)
-    inv_depth = run_program(
-        device,
-        _inverse_depth_program(shape),
-        {"color": frame.color, "depth": frame.depth},
-        {},
-        "inv_depth",
-        (shape.layers, shape.height, shape.pitch),
-    )
-    plan = method.plan(frame, lens)
-    program = method.program(shape, plan, device.traits)
-    inputs = {"color": frame.color, "inv_depth": inv_depth}
-    return run_program(device, program, inputs, dict(plan.params), "image", (*shape.output_size, 4))
+    return render_frame(device, Pyramid(**options), frame, lens)
 
 
 def rule_last(method: Pyramid, frame: LayeredFrame, lens: Lens) -> int:
@@ -348,24 +334,9 @@ def test_bad_options_are_refused(options: dict, message: str) -> None:
 @pytest.mark.parametrize("name", ["row", "tabletop", "glass", "plane"])
 def test_scenes_are_close_to_their_reference(device: Device, name: str) -> None:
     """At least 27 dB against a Gaussian lens; docs/methods/pyramid.md has the table at 512x512."""
-    require_opengl()
-    from cldof.capture.accumulate import accumulate
-    from cldof.capture.peel import DepthPeeler
-    from cldof.capture.scenes import builtin_scene
-
-    scene = builtin_scene(name)
-    camera = scene.camera_for(192, 192)
-    assert scene.aperture_radius_m is not None
-    assert scene.focus_distance_m is not None
-    lens = Lens(scene.aperture_radius_m, scene.focus_distance_m)
-    with DepthPeeler(192, 192) as peeler:
-        frame = peeler.peel(scene, camera, layers=4, lens=lens, guard_px=8)
-        reference = accumulate(peeler, scene, camera, lens, views=128, shape="gaussian")
-    expected = np.clip(reference.image[..., :3], 0, 1).astype(np.float64)
-    errors = [
-        (np.clip(image[..., :3], 0, 1) - expected) ** 2
-        for image in (render(device, frame, lens), frame.pinhole_image())
-    ]
-    reached, without = (-10.0 * math.log10(error.mean()) for error in errors)
+    scene = judged(name, "gaussian")
+    frame = scene.with_peels(4)
+    reached = psnr(render(device, frame, scene.lens), scene.reference)
+    without = psnr(frame.pinhole_image(), scene.reference)
     assert reached >= 27.0
     assert reached >= without + 4.0
