@@ -290,7 +290,19 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
         const int16 is_cell = is_here & (right >= 0.0f) & (below >= 0.0f) & (diagonal >= 0.0f)
                               & (absolute16(d_right) <= similar) & (absolute16(d_below) <= similar)
                               & (absolute16(coc16(diagonal, lens) - c) <= similar);
-        for (int i = 0; i < 16; i++) cells[row + x0 + i] = ((const int *)&is_cell)[i] ? 1 : 0;
+        for (int i = 0; i < 16; i++) {
+            int flag = ((const int *)&is_cell)[i] ? 1 : 0;
+#if LIGHTFIELD_GLASS
+            if (flag) { /* so x0 + i and y are not the last */
+                const __global float *alpha = color + (((size_t)line * size.width) + x0 + i) * 4 + 3;
+                const int kind = alpha[0] >= OPAQUE_ALPHA;
+                const int below_at = size.width * 4;
+                flag = (alpha[4] >= OPAQUE_ALPHA) == kind && (alpha[below_at] >= OPAQUE_ALPHA) == kind
+                       && (alpha[below_at + 4] >= OPAQUE_ALPHA) == kind;
+            }
+#endif
+            cells[row + x0 + i] = (uchar)flag;
+        }
         int is_open = 0;
         for (int t = x0 / TILE; t < x0 / TILE + 16 / TILE && t < size.tiles_x; t++) is_open |= open[t];
         if (!is_open) continue;
@@ -693,6 +705,86 @@ static inline float4 ray_color(const __global float *color, const __global float
 #define RAY_COLOR(...) ray_color(__VA_ARGS__)
 #endif
 
+/* Colours of sixteen rays of a view, side by side, from their winners; `end` of them count. (left, top) is the first
+ * one's place in the reference view in 1/256 px. Holes are left as they are. False if all are holes. */
+static inline int ray_colors(float4 found[16], uint2 hits[16], const __global uint2 *winners, int end,
+                             const __global float *color, const __global float *inv_depth,
+                             const __global uchar *cells, LightfieldSize size, LightfieldLens lens, int left, int top,
+                             float shift_x, float shift_y, uint seed
+#if LIGHTFIELD_LEVELS
+                             , const __global float *mips, const __global float *mip_depths, LightfieldMips mip_sizes
+#endif
+)
+{
+    /* Addresses of all at once, colours one by one. */
+    uint any = 0;
+    int16 key, at;
+    for (int i = 0; i < end; i++) {
+        hits[i] = winners[i];
+        any |= hits[i].x ^ NONE;
+    }
+    if (!any) return 0;
+    if (end == 16) {
+        const float16 low = load_quad((const __global float *)winners);
+        const float16 high = load_quad((const __global float *)(winners + 8));
+        at = as_int16((float16)(low.even, high.even));
+        key = as_int16((float16)(low.odd, high.odd));
+    } else {
+        at = key = (int16)((int)NONE);
+        for (int i = 0; i < end; i++) {
+            ((int *)&at)[i] = (int)hits[i].x;
+            ((int *)&key)[i] = (int)hits[i].y;
+        }
+    }
+    const int peel = size.height * size.pitch, color_peel = size.height * size.width;
+    const float16 w = as_float16(~key & 0x7fffffff), c = coc16(w, lens);
+    const int16 ray_x = left + (LANES << 8) - convert_int16(c * shift_x);
+    const int16 ray_y = top - convert_int16(c * shift_y);
+    const int16 cell_x = ray_x >> 8, cell_y = ray_y >> 8;
+    int16 peel_at = 0, color_at = 0;
+    for (int m = 1; m < size.peels; m++) {
+        const int16 is_behind = at >= m * peel;
+        peel_at = is_behind ? (int16)(m * peel) : peel_at;
+        color_at = is_behind ? (int16)(m * color_peel) : color_at;
+    }
+    const int16 cell = peel_at + cell_y * size.pitch + cell_x;
+    color_at += cell_y * size.width + cell_x;
+    /* The winner has to be one of the cell's four corners. */
+    const int16 off = at - cell;
+    int16 is_plain = (cell_x >= 0) & (cell_x + 1 < size.width) & (cell_y >= 0) & (cell_y + 1 < size.height)
+                     & ((off == 0) | (off == 1) | (off == size.pitch) | (off == size.pitch + 1));
+#if LIGHTFIELD_LEVELS
+    is_plain &= absolute16(c) * lens.cell < 1.41421356f;
+#endif
+    const float16 fx = convert_float16(ray_x & 255) * (1.0f / SUB);
+    const float16 fy = convert_float16(ray_y & 255) * (1.0f / SUB);
+    for (int i = 0; i < end; i++) {
+        if (hits[i].x == NONE) continue;
+        if (LIGHTFIELD_LOOKUP == 1 && ((const int *)&is_plain)[i] && cells[((const int *)&cell)[i]]) {
+            const __global float *corner = color + (size_t)((const uint *)&color_at)[i] * 4;
+            const float gx = ((const float *)&fx)[i], gy = ((const float *)&fy)[i];
+            const float4 p = load_pixel(corner), q = load_pixel(corner + size.width * 4);
+            const float4 above = p + gx * (load_pixel(corner + 4) - p);
+            const float4 below = q + gx * (load_pixel(corner + size.width * 4 + 4) - q);
+            found[i] = above + gy * (below - above);
+        } else {
+            found[i] = RAY_COLOR(color, inv_depth, size, lens, hits[i].x, ((const int *)&ray_x)[i],
+                                 ((const int *)&ray_y)[i], ((const float *)&w)[i], ((const float *)&c)[i], seed + i);
+        }
+    }
+    return 1;
+}
+
+#if LIGHTFIELD_LEVELS
+#define RAY_COLORS(...) ray_colors(__VA_ARGS__, mips, mip_depths, mip_sizes)
+#else
+#define RAY_COLORS(...) ray_colors(__VA_ARGS__)
+#endif
+
+#if LIGHTFIELD_GLASS
+static inline int is_before(uint2 a, uint2 b) { return a.y < b.y || (a.y == b.y && a.x < b.x); }
+#endif
+
 /* The layers of a pixel one over the other, for where no view has anything to say. */
 static inline float4 pinhole(const __global float *color, LightfieldSize size, int x, int y)
 {
@@ -729,7 +821,6 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
     if (x0 >= size.out_width || y >= size.out_height) return;
     const int n = size.out_width - x0 < SEGMENT ? size.out_width - x0 : SEGMENT;
     const size_t here = (size_t)y * size.out_pitch + x0, plane_size = (size_t)size.out_height * size.out_pitch;
-    const size_t peel = (size_t)size.height * size.pitch, color_peel = (size_t)size.height * size.width;
     float4 total[SEGMENT];
     float weights[SEGMENT];
     for (int i = 0; i < n; i++) {
@@ -744,91 +835,51 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
         const uint seed = ((uint)(first_view + s) << 24 ^ (uint)y << 12) + (uint)x0;
         const float shift_x = SUB * v.x, shift_y = SUB * v.y;
         const int left = (x0 + size.guard) << 8, top = (y + size.guard) << 8;
-#if LIGHTFIELD_GLASS
-        for (int i = 0; i < n; i++) {
-            /* What stands in front of the hidden-surface winner, nearest first. */
-            uint2 hits[MAX_PLANES];
-            int count = 0;
-            const uint2 solid = own[i];
-            for (int p = 1; p < size.planes; p++) {
-                const uint2 hit = own[p * plane_size + i];
-                if (hit.x == NONE || hit.y > solid.y || (hit.y == solid.y && hit.x > solid.x)) continue;
-                int k = count++;
-                for (; k > 0 && (hits[k - 1].y > hit.y || (hits[k - 1].y == hit.y && hits[k - 1].x > hit.x)); k--)
-                    hits[k] = hits[k - 1];
-                hits[k] = hit;
-            }
-            if (solid.x != NONE) hits[count++] = solid;
-            float4 seen_through = (float4)(0.0f);
-            for (int k = 0; k < count; k++) {
-                const float w = key_depth(hits[k].y), c = coc_of(w, lens);
-                const int ray_x = left + (i << 8) - (int)(c * shift_x), ray_y = top - (int)(c * shift_y);
-                seen_through += (1.0f - seen_through.w)
-                                * RAY_COLOR(color, inv_depth, size, lens, hits[k].x, ray_x, ray_y, w, c, seed + i);
-            }
-            /* A hole behind glass counts as far as the glass covers it. */
-            total[i] += weight * seen_through;
-            weights[i] += solid.x != NONE ? weight : weight * seen_through.w;
-        }
-#else
         for (int b = 0; b < n; b += 16) {
-            /* Sixteen pixels' addresses at once, one by one their colours. Words past the image's row are not used. */
-            int16 key, at;
-            if (b + 16 <= n) {
-                const float16 low = load_quad((const __global float *)(own + b));
-                const float16 high = load_quad((const __global float *)(own + b + 8));
-                at = as_int16((float16)(low.even, high.even));
-                key = as_int16((float16)(low.odd, high.odd));
-            } else {
-                for (int i = 0; i < 16; i++) {
-                    const uint2 hit = b + i < n ? own[b + i] : (uint2)(NONE);
-                    ((int *)&at)[i] = hit.x;
-                    ((int *)&key)[i] = hit.y;
-                }
-            }
-            const float16 w = as_float16(~key & 0x7fffffff), c = coc16(w, lens);
-            const int16 ray_x = left + ((b + LANES) << 8) - convert_int16(c * shift_x);
-            const int16 ray_y = top - convert_int16(c * shift_y);
-            const int16 cell_x = ray_x >> 8, cell_y = ray_y >> 8;
-            int16 peel_at = 0, color_at = 0;
-            for (int m = 1; m < size.peels; m++) {
-                const int16 is_behind = at >= m * (int)peel;
-                peel_at = is_behind ? (int16)(m * (int)peel) : peel_at;
-                color_at = is_behind ? (int16)(m * (int)color_peel) : color_at;
-            }
-            const int16 cell = peel_at + cell_y * size.pitch + cell_x;
-            color_at += cell_y * size.width + cell_x;
-            /* The winner has to be one of the cell's four corners. */
-            const int16 off = at - cell;
-            int16 is_plain = (cell_x >= 0) & (cell_x + 1 < size.width) & (cell_y >= 0) & (cell_y + 1 < size.height)
-                             & ((off == 0) | (off == 1) | (off == size.pitch) | (off == size.pitch + 1));
-#if LIGHTFIELD_LEVELS
-            is_plain &= absolute16(c) * lens.cell < 1.41421356f;
-#endif
-            const float16 fx = convert_float16(ray_x & 255) * (1.0f / SUB);
-            const float16 fy = convert_float16(ray_y & 255) * (1.0f / SUB);
             const int end = n - b < 16 ? n - b : 16;
+            float4 found[16];
+            uint2 hits[16];
+#define RAYS_OF(colors, winners_of, plane)                                                                            \
+    RAY_COLORS(colors, winners_of, own + (plane) * plane_size + b, end, color, inv_depth, cells, size, lens,          \
+               left + (b << 8), top, shift_x, shift_y, seed + b)
+#if LIGHTFIELD_GLASS
+            /* Rays that meet glass before what hides the rest: the panes over one another, then what is behind. A hole
+             * behind glass counts as far as the glass covers it. */
+            float4 panes[MAX_PLANES][16];
+            uint2 pane_hits[MAX_PLANES][16];
+            int has_pane[MAX_PLANES];
+            if (!RAYS_OF(found, hits, 0))
+                for (int i = 0; i < end; i++) hits[i] = (uint2)(NONE);
+            for (int p = 1; p < size.planes; p++) has_pane[p] = RAYS_OF(panes[p], pane_hits[p], p);
             for (int i = 0; i < end; i++) {
-                const uint winner = ((const uint *)&at)[i];
-                if (winner == NONE) continue;
-                float4 found;
-                if (LIGHTFIELD_LOOKUP == 1 && ((const int *)&is_plain)[i] && cells[((const int *)&cell)[i]]) {
-                    const __global float *corner = color + (size_t)((const uint *)&color_at)[i] * 4;
-                    const float gx = ((const float *)&fx)[i], gy = ((const float *)&fy)[i];
-                    const float4 p = load_pixel(corner), q = load_pixel(corner + size.width * 4);
-                    const float4 above = p + gx * (load_pixel(corner + 4) - p);
-                    const float4 below = q + gx * (load_pixel(corner + size.width * 4 + 4) - q);
-                    found = above + gy * (below - above);
-                } else {
-                    found = RAY_COLOR(color, inv_depth, size, lens, winner, ((const int *)&ray_x)[i],
-                                      ((const int *)&ray_y)[i], ((const float *)&w)[i], ((const float *)&c)[i],
-                                      seed + b + i);
+                const int is_hole = hits[i].x == NONE;
+                uint2 last = (uint2)(0);
+                float4 ray = (float4)(0.0f);
+                for (int turn = 1; turn < size.planes; turn++) {
+                    int next = 0; /* the nearest pane that comes after the last one */
+                    for (int p = 1; p < size.planes; p++) {
+                        if (!has_pane[p] || pane_hits[p][i].x == NONE || !is_before(pane_hits[p][i], hits[i])) continue;
+                        if (turn > 1 && !is_before(last, pane_hits[p][i])) continue;
+                        if (next == 0 || is_before(pane_hits[p][i], pane_hits[next][i])) next = p;
+                    }
+                    if (next == 0) break;
+                    last = pane_hits[next][i];
+                    ray += (1.0f - ray.w) * panes[next][i];
                 }
-                total[b + i] += weight * found;
+                weights[b + i] += is_hole ? weight * ray.w : weight;
+                if (!is_hole) ray += (1.0f - ray.w) * found[i];
+                total[b + i] += weight * ray;
+            }
+#else
+            if (!RAYS_OF(found, hits, 0)) continue;
+            for (int i = 0; i < end; i++) {
+                if (hits[i].x == NONE) continue;
+                total[b + i] += weight * found[i];
                 weights[b + i] += weight;
             }
-        }
 #endif
+#undef RAYS_OF
+        }
     }
     for (int i = 0; i < n; i++) {
         if (!is_last) {
