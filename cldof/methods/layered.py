@@ -57,7 +57,7 @@ _SEAM_REACH = 2.0
 # Steps of the cascade when none is given: 1 px, or less until the side with more blur has so many layers, but no less
 # than 2^(-12/8) = 0.35 px. Fewer layers cost quality, finer steps are below what pixels can show.
 _STEPS_PER_OCTAVE = 8
-_USUAL_LAYERS_A_SIDE = 6
+_USUAL_LAYERS_A_SIDE = 8
 _FINEST_STEP = 12
 
 _SIZE = np.dtype([(name, np.int32) for name in ("width", "height", "pitch", "peels", "tiles_x", "tiles_y")])
@@ -134,7 +134,7 @@ class Layered:
     sigma_step : float, optional
         Step of the cascade in px: the blur grows by ``n * sigma_step`` at the n-th layer from the focus. Smaller steps
         give more layers and as a rule a better match; 1 is the paper's. None: 1, or as much less as gives the side with
-        more blur six layers.
+        more blur eight layers.
     cascade : bool
         False blurs every layer by itself (the paper's slower variant).
     matting : {"seamless", "paper"}

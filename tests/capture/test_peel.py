@@ -16,6 +16,7 @@ from cldof import Camera, Lens
 from cldof.capture.load import load_scene
 from cldof.capture.peel import DepthPeeler
 from cldof.capture.scene import Ambient, DirectionalLight, Gradient, Material, Node, PointLight, Scene
+from cldof.capture.scenes import builtin_scene
 from cldof.errors import CaptureError, InputError, SceneError
 
 from .conftest import camera_at, flat, quad
@@ -33,7 +34,9 @@ def pixel_rays(camera: Camera) -> NDArray[np.float64]:
 def ray_layers(scene: Scene, camera: Camera, layers: int) -> NDArray[np.float64]:
     """Sorted planar depths of the first hits of each pixel's ray, from Embree."""
     pytest.importorskip("embreex")
-    mesh = trimesh.util.concatenate([n.mesh.copy().apply_transform(n.transform) for n in scene.nodes])
+    # Geometry alone: textures would be merged into one picture.
+    parts = [trimesh.Trimesh(n.mesh.vertices, n.mesh.faces, process=False) for n in scene.nodes]
+    mesh = trimesh.util.concatenate([p.apply_transform(n.transform) for p, n in zip(parts, scene.nodes, strict=True)])
     first_hit = trimesh.ray.ray_pyembree.RayMeshIntersector(mesh).intersects_first
     corners, normals = mesh.triangles, mesh.face_normals
     rays, eye = pixel_rays(camera).reshape(-1, 3), camera.pose[:3, 3]
@@ -97,6 +100,12 @@ def knot() -> Scene:
 @pytest.mark.parametrize("scene", [fence(), knot()], ids=lambda scene: scene.name)
 def test_layers_are_the_hits_of_rays(peeler: DepthPeeler, scene: Scene) -> None:
     assert_layers_agree(peeler, scene, camera_at(311, 257))
+
+
+@pytest.mark.parametrize("name", ["row", "silhouettes"])
+def test_built_in_layers_are_the_hits_of_rays(peeler: DepthPeeler, name: str) -> None:
+    scene = dataclasses.replace(builtin_scene(name), background=None)
+    assert_layers_agree(peeler, scene, scene.camera_for(512, 512))
 
 
 def test_bunny_layers_are_the_hits_of_rays(peeler: DepthPeeler, models: Path) -> None:
