@@ -26,7 +26,7 @@ import numpy as np
 
 from . import __version__
 from .camera import Camera
-from .errors import CldofError, DeviceError, FrameError, InputError, SceneError
+from .errors import CldofError, DeviceError, FrameError, InputError
 from .files import atomic_write
 from .frame import LayeredFrame
 from .lens import Aperture, DiscAperture, GaussianAperture, ImageAperture, Lens, PolygonAperture
@@ -573,26 +573,14 @@ def _aimed(
 
 
 def _scene(arguments: argparse.Namespace) -> Scene:
-    from .capture.scenes import builtin_scenes
+    from .capture.find import find_scene
 
-    builtin = builtin_scenes()
     turned = _flags(arguments, "azimuth", "elevation")
-    if arguments.scene in builtin:
-        scene = builtin[arguments.scene].make()
-        if arguments.unlit:
-            scene = dataclasses.replace(scene, unlit=True)
-    elif not Path(arguments.scene).exists():
-        raise SceneError(
-            f"{arguments.scene!r} is neither a file nor a built-in scene; built in are {', '.join(builtin)}."
-        )
-    else:
-        from .capture.load import load_scene
-
-        view = {f"{name}_deg": getattr(arguments, name) for name in ("azimuth", "elevation")}
-        view = {name: angle for name, angle in view.items() if angle is not None}
-        if not all(map(math.isfinite, view.values())):
-            raise InputError(f"{' and '.join(turned)}: angles must be finite.")
-        scene = load_scene(arguments.scene, unlit=arguments.unlit, **view)
+    view = {f"{name}_deg": getattr(arguments, name) for name in ("azimuth", "elevation")}
+    view = {name: angle for name, angle in view.items() if angle is not None}
+    if not all(map(math.isfinite, view.values())):
+        raise InputError(f"{' and '.join(turned)}: angles must be finite.")
+    scene = find_scene(arguments.scene, unlit=arguments.unlit, **view)
     if turned and scene.camera is not None:
         raise InputError(f"{arguments.scene} has a camera of its own; leave out {', '.join(turned)}, or use --camera.")
     return dataclasses.replace(scene, background=None) if arguments.transparent else scene

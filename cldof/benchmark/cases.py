@@ -18,7 +18,6 @@ from ..capture.accumulate import Reference, accumulate
 from ..capture.peel import DepthPeeler
 from ..capture.reference_cache import ReferenceCache
 from ..capture.scene import Scene
-from ..errors import SceneError
 from ..frame import LayeredFrame
 from ..lens import Lens
 from .record import Times
@@ -163,17 +162,9 @@ def build_scene(key: CaseKey) -> Scene:
     SceneError
         Neither built in nor a file.
     """
-    from ..capture.scenes import builtin_scenes
+    from ..capture.find import find_scene
 
-    builtin = builtin_scenes()
-    if key.scene in builtin:
-        scene = builtin[key.scene].make()
-        return dataclasses.replace(scene, unlit=True) if key.unlit else scene
-    if not Path(key.scene).is_file():
-        raise SceneError(f"{key.scene!r} is neither a file nor a built-in scene; built in are {', '.join(builtin)}.")
-    from ..capture.load import load_scene
-
-    return load_scene(key.scene, unlit=key.unlit)
+    return find_scene(key.scene, unlit=key.unlit)
 
 
 def lens_for(scene: Scene, look: LayeredFrame, camera: Camera) -> Lens:

@@ -31,7 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report-only", action="store_true", help="measure nothing: tables, plots and page from stored results"
     )
-    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="built-in names or files (default: all built in)")
+    parser.add_argument(
+        "--scenes",
+        nargs="+",
+        metavar="SCENE",
+        help="built-in names, files, or bunnies:FILE for nine of a model (default: all built in)",
+    )
     parser.add_argument("--sizes", nargs="+", metavar="WxH", help="image sizes (default 512x512)")
     parser.add_argument("--methods", nargs="+", metavar="METHOD", help="methods, accumulate, peers (default: all)")
     parser.add_argument(

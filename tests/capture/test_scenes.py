@@ -11,6 +11,7 @@ import pytest
 
 from cldof import Lens, SceneError
 from cldof.capture import shapes
+from cldof.capture.find import find_scene
 from cldof.capture.model_scenes import bunnies
 from cldof.capture.peel import DepthPeeler
 from cldof.capture.scene import Scene
@@ -194,3 +195,13 @@ def test_moved_meshes_keep_their_normals() -> None:
     assert np.allclose(mesh.vertices.mean(axis=0), (1, 2, 3), atol=0.05)
     facing = (mesh.face_normals * np.asarray(mesh.vertex_normals)[mesh.faces].mean(axis=1)).sum(axis=1)
     assert facing.min() > 0.9
+
+
+def test_a_scene_is_found_by_name_or_file_or_put_around_a_model(models: Path) -> None:
+    assert find_scene("row", unlit=True).unlit
+    assert find_scene(str(models / "Duck.glb")).camera is not None
+    nine = find_scene(f"bunnies:{models / 'suzanne.obj'}")
+    assert nine.focus_distance_m is not None
+    assert len(nine.nodes) > 9
+    with pytest.raises(SceneError, match="neither a file nor a built-in scene"):
+        find_scene("bunnies")
