@@ -28,11 +28,11 @@
 #define LAYERED_ALPHA_RUN 0
 #endif
 
-/* 1: some slots are neither empty nor opaque. */
+/* 1: some slots are neither empty nor opaque, and are shared out; not with LAYERED_PAPER. */
 #ifndef LAYERED_GLASS
 #define LAYERED_GLASS 0
 #endif
-/* 1: matting functions as published, without what layered_weight and layered_glass add. */
+/* 1: matting functions as published, without what layered_weight adds. */
 #ifndef LAYERED_PAPER
 #define LAYERED_PAPER 0
 #endif
@@ -202,7 +202,7 @@ static inline float16 layered_color(float16 c, float4 w, int is_last)
     return c;
 }
 
-#if LAYERED_GLASS && !LAYERED_PAPER
+#if LAYERED_GLASS
 /* Weights of four slots that are not opaque. An opaque slot may stand in several layers at full weight, since more of
  * the same paint changes nothing; glass must not be counted twice. It is shared out between the layer whose interval it
  * is in and the one before, so that both together let through exactly 1 - alpha: (1 - t) in front of
@@ -236,7 +236,7 @@ static inline void layered_block(float16 quad[4], const __global float *color, c
         const __global float *rgba = color + (row * size.width + x) * 4;
         float4 weights[4] = {weight.s0123, weight.s4567, weight.s89ab, weight.scdef};
         const float4 inverse[4] = {w.s0123, w.s4567, w.s89ab, w.scdef};
-#if LAYERED_GLASS && !LAYERED_PAPER
+#if LAYERED_GLASS
         const float4 inverse_before[4] = {before.s0123, before.s4567, before.s89ab, before.scdef};
 #endif
 #pragma unroll
@@ -245,7 +245,7 @@ static inline void layered_block(float16 quad[4], const __global float *color, c
             if (valid <= 0) continue;
             float16 c = valid >= 4 ? load_quad(rgba + 16 * q) : load_quad_part(rgba + 16 * q, valid);
             c = layered_color(c, inverse[q], m == size.peels - 1);
-#if LAYERED_GLASS && !LAYERED_PAPER
+#if LAYERED_GLASS
             weights[q] = layered_glass(weights[q], c.s37bf, inverse[q], inverse_before[q], layer, m);
 #endif
             quad[q] = over(quad[q], c * spread(weights[q]));
@@ -272,6 +272,19 @@ static inline void layered_add(__local float *line, int line_width, const float1
         float16 layer = load_quad_local(at);
         store_quad_local(at, in_front ? over(filtered[i], layer) : over(layer, filtered[i]));
     }
+}
+
+/* Whether an image is there in a tile or in any whose rows its column filter would bring there; `below` as in
+ * LayeredStep. */
+static inline int layered_is_reached(const __global int *reached, int below, int tx, int ty, int radius,
+                                     LayeredSize size)
+{
+    if (below != 1) return below;
+    int first = clamp_index(ty * FIR_ROWS - radius, size.height - 1) / FIR_ROWS;
+    int last = clamp_index(ty * FIR_ROWS + FIR_ROWS - 1 + radius, size.height - 1) / FIR_ROWS;
+    int any = 0;
+    for (int r = first; r <= last; r++) any |= reached[r * size.tiles_x + tx];
+    return any;
 }
 
 /* layered_classify: which peels bring something to which layer, per tile.
@@ -351,12 +364,7 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
         int tx = tile0 + t, s = 0;
         if (tx >= 0 && tx < size.tiles_x) {
             s = layer_peels[tx] ? 2 : 0;
-            if (step.below == 1) {
-                int first = clamp_index(y0 - step.radius_in, size.height - 1) / FIR_ROWS;
-                int last = clamp_index(y0 + FIR_ROWS - 1 + step.radius_in, size.height - 1) / FIR_ROWS;
-                for (int r = first; r <= last; r++) s |= reached[r * size.tiles_x + tx] ? 1 : 0;
-            }
-            s |= step.below == 2 ? 1 : 0;
+            s |= layered_is_reached(reached, step.below, tx, ty, step.radius_in, size) ? 1 : 0;
         }
         state[t] = s;
     }
@@ -447,17 +455,6 @@ typedef struct {
     int radius_back, taps_back;
     int guard;
 } LayeredResolve;
-
-static inline int layered_is_reached(const __global int *reached, int below, int tx, int ty, int radius,
-                                     LayeredSize size)
-{
-    if (below != 1) return below;
-    int first = clamp_index(ty * FIR_ROWS - radius, size.height - 1) / FIR_ROWS;
-    int last = clamp_index(ty * FIR_ROWS + FIR_ROWS - 1 + radius, size.height - 1) / FIR_ROWS;
-    int any = 0;
-    for (int r = first; r <= last; r++) any |= reached[r * size.tiles_x + tx];
-    return any;
-}
 
 /* layered_resolve: front over the layer in focus over back, divided by coverage (eq. 12, section 3.3.1).
  * reads   front, back  float[height][pitch][4]  blurred along the rows, the column filter still owed

@@ -90,8 +90,6 @@ static inline uint depth_key(float w)
     return bits & 0x80000000u ? bits : ~(bits | 0x80000000u);
 }
 
-static inline float key_depth(uint key) { return as_float(~key & 0x7fffffffu); } /* of w >= 0 */
-
 static inline float coc_of(float w, LightfieldLens lens)
 {
     float c = lens.c1 * w + lens.c0;

@@ -6,12 +6,14 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from ..frame import LayeredFrame
 from ..host.device import Traits
 from ..host.passes import FrameProgram
 from ..lens import Lens
 
-__all__ = ["FrameShape", "Method", "Plan", "row_pitch"]
+__all__ = ["FrameShape", "Method", "Plan", "row_pitch", "struct_scalar"]
 
 
 class FrameShape(NamedTuple):
@@ -57,6 +59,13 @@ def row_pitch(width: int) -> int:
     """
     pitch = -(-width // 16) * 16
     return pitch + 16 if pitch % 256 == 0 else pitch
+
+
+def struct_scalar(dtype: np.dtype[Any], *values: int) -> np.generic:
+    """A struct argument of a kernel, field by field."""
+    record: Any = np.array(values, dtype)
+    scalar: np.generic = record[()]
+    return scalar
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from ..frame import LayeredFrame
 from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Param, Pass, Role, read, write
 from ..lens import Lens, lens_samples
-from .base import FrameShape, Plan
+from .base import FrameShape, Plan, struct_scalar
 from .pyramid import SIZE as FLATTEN_SIZE
 
 __all__ = ["Gather", "gather_samples"]
@@ -69,10 +68,9 @@ class Gather:
         samples = gather_samples(self.samples, self.kernel)
         items = 1 if traits.is_cpu else min(64, traits.max_work_group_size)
         local_size = (1, 1) if traits.is_cpu else None
-        flatten_size: Any = np.array(
-            (shape.width, shape.height, shape.pitch, shape.layers, 1, 0, shape.guard_px), FLATTEN_SIZE
-        )[()]
-        size: Any = np.array((shape.width, shape.height, shape.pitch, shape.guard_px), _SIZE)[()]
+        extent = (shape.width, shape.height, shape.pitch)
+        flatten_size = struct_scalar(FLATTEN_SIZE, *extent, shape.layers, 1, 0, shape.guard_px)
+        size = struct_scalar(_SIZE, *extent, shape.guard_px)
         buffers = [
             Buffer("color", shape.layers * pixels * 16, Role.INPUT),
             Buffer("inv_depth", shape.layers * padded * 4, Role.INPUT),

@@ -39,7 +39,7 @@ from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Local, Param, Pass, Role, read, read_write, write
 from ..lens import GAUSSIAN_SIGMA, Lens
 from . import gaussian
-from .base import FrameShape, Plan
+from .base import FrameShape, Plan, struct_scalar
 
 __all__ = ["MAX_LAYERS", "LayerStack", "Layered", "matting_functions"]
 
@@ -318,7 +318,9 @@ class _Builder:
         self.local_size = min(blocking.local_size, traits.max_work_group_size)
         self.blocking, self.local_limit = blocking, traits.local_mem_bytes
         self.tiles_x, self.tiles_y = -(-shape.width // _TILE), -(-shape.height // blocking.rows)
-        self.size = _struct(_SIZE, shape.width, shape.height, shape.pitch, shape.layers, self.tiles_x, self.tiles_y)
+        self.size = struct_scalar(
+            _SIZE, shape.width, shape.height, shape.pitch, shape.layers, self.tiles_x, self.tiles_y
+        )
         self.image_bytes = shape.height * shape.pitch * 16
         self.pixels = shape.height * shape.width
         self.taps = _Taps()
@@ -349,7 +351,7 @@ class _Builder:
             *self.blocking.defines,
             ("LAYERED_VOID", int(not self.shape.is_opaque)),
             ("LAYERED_ALPHA_RUN", int(alpha_run)),
-            ("LAYERED_GLASS", int(self.shape.has_glass)),
+            ("LAYERED_GLASS", int(self.shape.has_glass and self.method.matting != "paper")),
             ("LAYERED_PAPER", int(self.method.matting == "paper")),
         )
         # The second run fills in the alpha of the image that the first one wrote.
@@ -418,7 +420,9 @@ class _Builder:
         self.buffers.append(Buffer(reached, self.tiles_x * self.tiles_y * 4))
         blocking = self.blocking
         segment = min(blocking.segment, -(-self.shape.width // _TILE) * _TILE)
-        step = _struct(_STEP, layer, int(in_front), image.below, radius_in, taps_in, radius_out, taps_out, segment)
+        step = struct_scalar(
+            _STEP, layer, int(in_front), image.below, radius_in, taps_in, radius_out, taps_out, segment
+        )
         halo_tiles = -(-_halo(radius_out) // _TILE)
         groups = (-(-self.shape.width // segment), self.tiles_y)
         self._add(
@@ -473,7 +477,7 @@ class _Builder:
 
     def _resolve(self, front: _Image, back: _Image) -> None:
         ends = [(image.below, *self.taps.centre(image.sigma)) for image in (front, back)]
-        resolve = _struct(
+        resolve = struct_scalar(
             _RESOLVE,
             self.stack.front,
             ends[0][0],
@@ -548,9 +552,3 @@ class _Builder:
 def _halo(radius: int) -> int:
     """Pixels that a line block reaches beyond its segment; as in kernels/layered.cl."""
     return (radius + 19) & ~15
-
-
-def _struct(dtype: np.dtype[Any], *values: int) -> np.generic:
-    record: Any = np.array(values, dtype)
-    scalar: np.generic = record[()]
-    return scalar

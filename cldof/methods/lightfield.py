@@ -29,7 +29,7 @@ from ..frame import LayeredFrame
 from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
 from ..lens import Aperture, Lens
-from .base import FrameShape, Plan, row_pitch
+from .base import FrameShape, Plan, row_pitch, struct_scalar
 
 __all__ = ["MAX_VIEWS", "LightField", "Views", "lens_views"]
 
@@ -223,7 +223,7 @@ class _Builder:
         self.out_pitch = row_pitch(self.out_width)
         self.planes = 1 + (_GLASS_PLANES if shape.has_glass else 0)
         self.tiles = (-(-shape.width // _TILE), self.peels * -(-shape.height // _TILE))
-        self.size = _struct(
+        self.size = struct_scalar(
             _SIZE, shape.width, shape.height, shape.pitch, self.peels, self.out_width, self.out_height, self.out_pitch,
             shape.guard_px, self.planes, self.tiles[0], self.tiles[1] // self.peels,
         )  # fmt: skip
@@ -387,9 +387,3 @@ class _Builder:
     @staticmethod
     def _has_heavy_items(kernel: str) -> bool:
         return kernel not in ("lightfield_clear", "lightfield_depths", "lightfield_sources", "lightfield_packed")
-
-
-def _struct(dtype: np.dtype[Any], *values: int) -> np.generic:
-    record: Any = np.array(values, dtype)
-    scalar: np.generic = record[()]
-    return scalar

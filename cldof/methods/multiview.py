@@ -28,7 +28,7 @@ from ..frame import LayeredFrame
 from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
 from ..lens import Aperture, Lens
-from .base import FrameShape, Plan
+from .base import FrameShape, Plan, struct_scalar
 
 __all__ = ["CELL", "MAX_LAYERS", "MAX_RAYS", "Cone", "LensLayers", "Multiview", "RaySets", "cones", "ray_sets"]
 
@@ -265,8 +265,7 @@ class _Builder:
         self.is_cpu = traits.is_cpu
         self.cells = (-(-shape.width // CELL), -(-shape.height // CELL))
         values = (shape.width, shape.height, shape.pitch, shape.layers, layers.total, *self.cells)
-        record: Any = np.array(values, _SIZE)
-        self.size = record[()]
+        self.size = struct_scalar(_SIZE, *values)
         self.lens = (Param("c1", _FLOAT), Param("c0", _FLOAT))
         self.stride = _JITTER if method.jitter else 1
         self.peeled = method.traversal == "peels"
