@@ -28,6 +28,7 @@ from . import __version__
 from .camera import Camera
 from .errors import CldofError, DeviceError, FrameError, InputError
 from .files import atomic_write
+from .focus import autofocus, focus_at, focus_on
 from .frame import LayeredFrame
 from .lens import Aperture, DiscAperture, GaussianAperture, ImageAperture, Lens, PolygonAperture
 
@@ -100,61 +101,9 @@ def _parser() -> argparse.ArgumentParser:
         help="a scene file (glb, gltf, obj, ply, stl ...), a frame saved as .npz, or a name from 'cldof scenes'",
     )
     render.add_argument("-o", "--output", required=True, metavar="FILE", help=".png (sRGB), .exr or .npy (linear)")
-
-    view = render.add_argument_group("view (not for .npz frames, which have their own)")
-    view.add_argument("--size", type=_size, metavar="WxH", help="image size in pixels (default 1024x1024)")
-    view.add_argument("--yfov", type=_number, metavar="DEG", help="full vertical field of view in degrees")
-    view.add_argument(
-        "--camera", metavar="FILE", help="JSON with yfov_deg, pose_camera_to_world (4x4, glTF axes), znear, zfar"
-    )
-    view.add_argument("--unlit", action="store_true", help="show base colours without any light")
-    view.add_argument("--transparent", action="store_true", help="leave out the background; alpha tells where it was")
-    view.add_argument("--peels", type=int, metavar="N", help=f"layers to capture at most (default {_DEFAULT_PEELS})")
-    view.add_argument(
-        "--azimuth", type=_number, metavar="DEG", help="see files without a camera from here, +z to +x (default 30)"
-    )
-    view.add_argument("--elevation", type=_number, metavar="DEG", help="and from this far up (default 14)")
-
-    lens = render.add_argument_group("lens")
-    opening = lens.add_mutually_exclusive_group()
-    opening.add_argument(
-        "--aperture-radius", type=_number, metavar="M", help="aperture radius in metres; 0 is a pinhole"
-    )
-    opening.add_argument("--f-number", type=_number, metavar="N", help="focal length over aperture diameter")
-    lens.add_argument(
-        "--focal-length",
-        type=_number,
-        metavar="MM",
-        help="with --f-number; by default the one that gives this view on a sensor 24 mm high",
-    )
-    focus = lens.add_mutually_exclusive_group()
-    focus.add_argument("--focus-distance", type=_number, metavar="M", help="planar distance in metres; inf is legal")
-    focus.add_argument("--focus-at", type=_pixel, metavar="X,Y", help="focus on what is seen at this pixel")
-
-    lens.add_argument(
-        "--aperture",
-        metavar="SHAPE",
-        help="disc, gaussian, polygon:BLADES[:ROTATION_DEG[:CURVATURE]] or image:FILE; for --method accumulate",
-    )
-    lens.add_argument("--anamorphic", type=_number, metavar="RATIO", help="height over width of that shape (default 1)")
-
-    how = render.add_argument_group("how")
-    how.add_argument("--method", default="layered", help="a name from 'cldof methods' (default layered)")
-    how.add_argument("--device", metavar="DEVICE", help="OpenCL device: index or part of a name from 'cldof devices'")
-    how.add_argument(
-        "--supersample", type=int, metavar="N", help="capture N times larger and scale down after the blur (default 1)"
-    )
-    how.add_argument(
-        "--option",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="an option of the method; see 'cldof methods'",
-    )
-    how.add_argument("--layers", metavar="K", help="the most depth layers; short for --option layers=K")
-    how.add_argument("--sigma-step", metavar="PX", help="short for --option sigma_step=PX")
-    how.add_argument("--no-cascade", action="store_true", help="short for --option cascade=false")
-    how.add_argument("--engine", metavar="NAME", help="short for --option engine=NAME")
+    _add_view(render)
+    _add_lens(render)
+    _add_method(render)
 
     brute = render.add_argument_group("--method accumulate: many views through the lens, averaged")
     brute.add_argument("--views", type=int, metavar="N", help=f"how many (default {_DEFAULT_VIEWS})")
@@ -170,6 +119,19 @@ def _parser() -> argparse.ArgumentParser:
     more.add_argument("--save-frame", metavar="FILE", help="also save the captured layers (.npz), to render again")
     more.add_argument("--report", metavar="FILE", help="also save lens, camera, device, plan and times as JSON")
     more.add_argument("--quiet", action="store_true", help="print errors only")
+
+    sequence = commands.add_parser(
+        "sequence",
+        help="render frames in which focus or aperture move, captured once",
+        description="Render SCENE while focus and f-number move from key to key. The scene is captured once.",
+    )
+    sequence.set_defaults(run=_sequence)
+    from .sequence_command import add_arguments as add_sequence_arguments
+
+    add_sequence_arguments(sequence)
+    _add_view(sequence)
+    _add_lens(sequence)
+    _add_method(sequence)
 
     methods = commands.add_parser(
         "methods", help="list methods and their options", description="List methods and their options."
@@ -192,6 +154,69 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    view = parser.add_argument_group("view (not for .npz frames, which have their own)")
+    view.add_argument("--size", type=_size, metavar="WxH", help="image size in pixels (default 1024x1024)")
+    view.add_argument("--yfov", type=_number, metavar="DEG", help="full vertical field of view in degrees")
+    view.add_argument(
+        "--camera", metavar="FILE", help="JSON with yfov_deg, pose_camera_to_world (4x4, glTF axes), znear, zfar"
+    )
+    view.add_argument("--unlit", action="store_true", help="show base colours without any light")
+    view.add_argument("--transparent", action="store_true", help="leave out the background; alpha tells where it was")
+    view.add_argument("--peels", type=int, metavar="N", help=f"layers to capture at most (default {_DEFAULT_PEELS})")
+    view.add_argument(
+        "--azimuth", type=_number, metavar="DEG", help="see files without a camera from here, +z to +x (default 30)"
+    )
+    view.add_argument("--elevation", type=_number, metavar="DEG", help="and from this far up (default 14)")
+
+
+def _add_lens(parser: argparse.ArgumentParser) -> None:
+    lens = parser.add_argument_group("lens")
+    opening = lens.add_mutually_exclusive_group()
+    opening.add_argument(
+        "--aperture-radius", type=_number, metavar="M", help="aperture radius in metres; 0 is a pinhole"
+    )
+    opening.add_argument("--f-number", type=_number, metavar="N", help="focal length over aperture diameter")
+    lens.add_argument(
+        "--focal-length",
+        type=_number,
+        metavar="MM",
+        help="with --f-number; by default the one that gives this view on a sensor 24 mm high",
+    )
+    focus = lens.add_mutually_exclusive_group()
+    focus.add_argument("--focus-distance", type=_number, metavar="M", help="planar distance in metres; inf is legal")
+    focus.add_argument("--focus-at", type=_pixel, metavar="X,Y", help="focus on what is seen at this pixel")
+    focus.add_argument("--focus-on", metavar="NODE", help="focus on this node of the scene, by name or number")
+    focus.add_argument("--autofocus", action="store_true", help="focus on the nearest surface in the middle")
+
+    lens.add_argument(
+        "--aperture",
+        metavar="SHAPE",
+        help="disc, gaussian, polygon:BLADES[:ROTATION_DEG[:CURVATURE]] or image:FILE; for --method accumulate",
+    )
+    lens.add_argument("--anamorphic", type=_number, metavar="RATIO", help="height over width of that shape (default 1)")
+
+
+def _add_method(parser: argparse.ArgumentParser) -> None:
+    how = parser.add_argument_group("how")
+    how.add_argument("--method", default="layered", help="a name from 'cldof methods' (default layered)")
+    how.add_argument("--device", metavar="DEVICE", help="OpenCL device: index or part of a name from 'cldof devices'")
+    how.add_argument(
+        "--supersample", type=int, metavar="N", help="capture N times larger and scale down after the blur (default 1)"
+    )
+    how.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="an option of the method; see 'cldof methods'",
+    )
+    how.add_argument("--layers", metavar="K", help="the most depth layers; short for --option layers=K")
+    how.add_argument("--sigma-step", metavar="PX", help="short for --option sigma_step=PX")
+    how.add_argument("--no-cascade", action="store_true", help="short for --option cascade=false")
+    how.add_argument("--engine", metavar="NAME", help="short for --option engine=NAME")
+
+
 def _size(text: str) -> tuple[int, int]:
     width, cross, height = text.lower().partition("x")
     if not (cross and width.isdecimal() and height.isdecimal()):
@@ -212,6 +237,12 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def _sequence(arguments: argparse.Namespace) -> None:
+    from .sequence_command import sequence
+
+    sequence(arguments)
 
 
 def _bench(arguments: argparse.Namespace) -> None:
@@ -539,18 +570,34 @@ def _capture_shot(arguments: argparse.Namespace, settings: _Settings, factor: in
     camera = _camera(arguments, scene)
     with DepthPeeler(camera.width, camera.height) as peeler:
         preview, lens, remarks = _aimed(arguments, settings, peeler, scene, camera, watch)
-        needed = math.ceil(_largest_coc_px(lens, camera, preview))
-        guard = min(needed, math.ceil(_GUARD_SHARE * max(camera.width, camera.height)))
-        if guard < needed:
-            remarks.append(
-                f"the guard band is capped at {guard} px, the largest blur radius is {needed} px: light from beyond "
-                "the edges is missing there"
-            )
-        peels = _DEFAULT_PEELS if arguments.peels is None else arguments.peels
-        large = camera.supersampled(factor)
-        with watch.step("capture") as progress:
-            frame = peeler.peel(scene, large, layers=peels, lens=lens, guard_px=factor * guard, progress=progress)
+        frame = _capture(arguments, peeler, scene, camera, preview, [lens], remarks, factor, watch)
         return _Shot(frame, lens, camera, remarks, peeler.device)
+
+
+def _capture(
+    arguments: argparse.Namespace,
+    peeler: DepthPeeler,
+    scene: Scene,
+    camera: Camera,
+    preview: LayeredFrame,
+    lenses: Sequence[Lens],
+    remarks: list[str],
+    factor: int,
+    watch: _Stopwatch,
+) -> LayeredFrame:
+    """Layers that serve all lenses, with a guard band for the largest blur."""
+    needed = math.ceil(max(_largest_coc_px(lens, camera, preview) for lens in lenses))
+    guard = min(needed, math.ceil(_GUARD_SHARE * max(camera.width, camera.height)))
+    if guard < needed:
+        remarks.append(
+            f"the guard band is capped at {guard} px, the largest blur radius is {needed} px: light from beyond "
+            "the edges is missing there"
+        )
+    peels = _DEFAULT_PEELS if arguments.peels is None else arguments.peels
+    widest = max(lenses, key=lambda lens: lens.aperture_radius_m)
+    large = camera.supersampled(factor)
+    with watch.step("capture") as progress:
+        return peeler.peel(scene, large, layers=peels, lens=widest, guard_px=factor * guard, progress=progress)
 
 
 def _aimed(
@@ -560,11 +607,12 @@ def _aimed(
     scene: Scene,
     camera: Camera,
     watch: _Stopwatch,
+    whole: bool = False,
 ) -> tuple[LayeredFrame, Lens, list[str]]:
-    """A first look at the scene, and the lens that follows from it."""
+    """A first look at the scene, and the lens that follows from it; ``whole`` looks at every pixel."""
     with watch.step("preview"):
         # On a pixel the depth has to be that pixel's own; for anything else a fraction of them is enough.
-        shrink = 1 if arguments.focus_at else _PREVIEW_SHRINK
+        shrink = 1 if whole or arguments.focus_at else _PREVIEW_SHRINK
         small = dataclasses.replace(
             camera, width=math.ceil(camera.width / shrink), height=math.ceil(camera.height / shrink)
         )
@@ -615,8 +663,16 @@ def _choose_lens(
     if arguments.focus_distance is not None:
         focus = arguments.focus_distance
     elif arguments.focus_at:
-        focus = _depth_at(frame, camera, arguments.focus_at)
+        focus = _focus_at(frame, camera, arguments.focus_at)
         remarks.append(f"focus on pixel {arguments.focus_at[0]:g},{arguments.focus_at[1]:g}: {focus:.4g} m")
+    elif arguments.focus_on is not None:
+        if scene is None:
+            raise InputError(f"--focus-on {arguments.focus_on}: a saved frame has no nodes; use --focus-at.")
+        focus = focus_on(scene, arguments.focus_on, frame, camera)
+        remarks.append(f"focus on node {arguments.focus_on}: {focus:.4g} m")
+    elif arguments.autofocus:
+        focus = autofocus(frame)
+        remarks.append(f"autofocus: {focus:.4g} m")
     elif scene is not None and scene.focus_distance_m is not None:
         focus = scene.focus_distance_m
     else:
@@ -640,7 +696,7 @@ def _choose_lens(
     return Lens(radius, focus, aperture=settings.aperture), remarks
 
 
-def _depth_at(frame: LayeredFrame, camera: Camera, pixel: tuple[float, float]) -> float:
+def _focus_at(frame: LayeredFrame, camera: Camera, pixel: tuple[float, float]) -> float:
     x, y = pixel
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise InputError(
@@ -648,11 +704,12 @@ def _depth_at(frame: LayeredFrame, camera: Camera, pixel: tuple[float, float]) -
         )
     # The frame may be larger than the image.
     scale = frame.camera.width / camera.width
-    column, row = int(x * scale), int(y * scale)
-    depth = frame.depth_at(column, row)
-    if math.isinf(depth) and frame.color[0, row + frame.guard_px, column + frame.guard_px, 3] == 0.0:
-        raise InputError(f"--focus-at {x:g},{y:g}: nothing is there. Choose another pixel, or use --focus-distance.")
-    return depth
+    try:
+        return focus_at(frame, x * scale, y * scale)
+    except FrameError:
+        raise InputError(
+            f"--focus-at {x:g},{y:g}: nothing is there. Choose another pixel, or use --focus-distance."
+        ) from None
 
 
 def _default_focus(frame: LayeredFrame) -> tuple[float, str]:

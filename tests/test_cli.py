@@ -608,3 +608,69 @@ def test_interrupted(frame_file: str, capsys: pytest.CaptureFixture[str], monkey
     assert main(["render", frame_file, "-o", "out.png"]) == 130
     assert "interrupted" in capsys.readouterr().err
     assert files() == {frame_file}
+
+
+# Sequences
+
+
+def test_a_sequence_of_a_saved_frame(
+    frame_file: str, on_device: DeviceInfo, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keys = ["--key", "0 focus=1 radius=0.05", "--key", "last at=1,1 radius=0"]
+    assert main(["sequence", frame_file, "-o", "f#.npy", "--frames", "3", *keys, "--report", "r.json"]) == 0
+    out, err = capsys.readouterr()
+    assert "f0.npy .. f2.npy  3 frames, 32x32" in out and not err
+    report = json.loads(Path("r.json").read_text())
+    lenses = [item["lens"] for item in report["frames"]]
+    # The pixel at 1,1 shows the wall at 3 m; half-way in 1/z is 1.5 m; an aperture that closes does so evenly.
+    assert [lens["focus_distance_m"] for lens in lenses] == pytest.approx([1.0, 1.5, 3.0])
+    assert [lens["aperture_radius_m"] for lens in lenses] == pytest.approx([0.05, 0.025, 0.0])
+    with cldof.Renderer(device=on_device.index) as renderer:
+        for index, (focus, radius) in enumerate(((1.0, 0.05), (1.5, 0.025), (3.0, 0.0))):
+            assert np.array_equal(np.load(f"f{index}.npy"), renderer.render(a_frame(), cldof.Lens(radius, focus)).image)
+
+
+def test_a_sequence_of_a_scene_is_captured_once(on_device: DeviceInfo, capsys: pytest.CaptureFixture[str]) -> None:
+    require_opengl()
+    base = ["--size", "40x40", "--frames", "2", "--quiet", "--report", "r.json"]
+    assert main(["sequence", "floating", "-o", "##.png", *base, "--key", "0 auto", "--key", "last on=knot"]) == 0
+    assert {"00.png", "01.png"} <= files()
+    frames = json.loads(Path("r.json").read_text())["frames"]
+    assert frames[1]["lens"]["focus_distance_m"] == pytest.approx(3.0, abs=0.4)
+    assert frames[0]["lens"]["aperture_radius_m"] == pytest.approx(0.03)
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    "options, says",
+    [
+        (["-o", "x.png"], "needs one run of #"),
+        (["-o", "#.png", "--frames", "11"], "room for 10 frames, not for 11"),
+        (["-o", "#.gif"], ".gif"),
+        (["-o", "#.png", "--frames", "0"], "--frames is 0"),
+        (["-o", "##.png", "--key", "x focus=1"], "not FRAME WORD=VALUE"),
+        (["-o", "##.png", "--key", ""], "not FRAME WORD=VALUE"),
+        (["-o", "##.png", "--key", "0"], "says nothing about the lens"),
+        (["-o", "##.png", "--key", "0 focus=1 auto"], "more than once"),
+        (["-o", "##.png", "--key", "0 zoom=2"], "'zoom=2' is none of"),
+        (["-o", "##.png", "--key", "0 focus=near"], "focus=near is not a number"),
+        (["-o", "##.png", "--key", "0 focus=-1"], "must be positive"),
+        (["-o", "##.png", "--key", "0 at=99,3"], "outside the image"),
+        (["-o", "##.png", "--key", "0 at=top"], "not X,Y in pixels"),
+        (["-o", "##.png", "--key", "0 on=knot"], "a saved frame has no nodes"),
+        (["-o", "##.png", "--key", "0 f=2"], "needs --focal-length"),
+        (["-o", "##.png", "--method", "accumulate"], "captured layers"),
+    ],
+)
+def test_impossible_sequences_are_refused(
+    frame_file: str, capsys: pytest.CaptureFixture[str], options: list[str], says: str
+) -> None:
+    frames = [] if "--frames" in options else ["--frames", "2"]
+    assert says in refused(capsys, "sequence", frame_file, *frames, *options)
+
+
+def test_focus_on_needs_a_scene_with_that_node(frame_file: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "a saved frame has no nodes" in refused(capsys, "render", frame_file, "-o", "x.png", "--focus-on", "knot")
+    require_opengl()
+    base = ["render", "floating", "-o", "x.png", "--size", "32x32"]
+    assert "no node 'tree'; named are knot" in refused(capsys, *base, "--focus-on", "tree")

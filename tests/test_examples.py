@@ -18,6 +18,7 @@ ARGUMENTS = {
     "render_npz": ["image.png", "--size", "96"],
     "render_scene": ["image.png", "--size", "96", "--scene", "floating"],
     "loop": ["--size", "96", "--frames", "4"],
+    "rack_focus": [".", "--size", "96", "--frames", "4"],
 }
 WITHOUT_OPENGL = {"render_npz"}
 

@@ -111,7 +111,7 @@ def load_scene(
     up = up or _UP_BY_SUFFIX.get(suffix) or _guess_up(nodes)
     if up != "y":
         turn = trimesh.geometry.align_vectors(_UP_AXES[up], _UP_AXES["y"])
-        nodes = [Node(node.mesh, turn @ node.transform, node.material) for node in nodes]
+        nodes = [replace(node, transform=turn @ node.transform) for node in nodes]
     bare = Scene(path.stem, tuple(nodes), view_from_deg=(azimuth_deg, elevation_deg))
     camera = _gltf_camera(document, bare)
     lights = _gltf_lights(document, bare.bounds.mean(axis=0))
@@ -195,7 +195,7 @@ def _nodes(loaded: Any, document: dict[str, Any], path: Path) -> list[Node]:
         if entry is None:
             continue
         if abs(float(np.linalg.det(np.asarray(transform)[:3, :3]))) > 0.0:  # a node scaled to 0 is hidden
-            nodes.append(Node(entry[0], transform, entry[1]))
+            nodes.append(Node(entry[0], transform, entry[1], str(name)))
             area += float(entry[0].area)
     if not nodes:
         raise SceneError(f"Scene {path} is empty: it holds no triangles.")

@@ -189,5 +189,5 @@ def _parts(value: Any) -> dict[str, Any]:
     if hasattr(value, "tobytes") and hasattr(value, "mode"):  # a PIL image
         return {"mode": value.mode, "size": tuple(value.size), "pixels": value.convert("RGBA").tobytes()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.name not in _NOT_SEEN}
     raise TypeError(f"{type(value).__name__} has no digest; cldof.capture.reference_cache must learn about it.")

@@ -99,11 +99,14 @@ class Node:
     transform : array_like, (4, 4)
         Mesh to world; any affine map that can be inverted.
     material : Material
+    name : str, optional
+        To find the node again, for instance to focus on it.
     """
 
     mesh: trimesh.Trimesh
     transform: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     material: Material = field(default_factory=Material)
+    name: str | None = None
 
     def __post_init__(self) -> None:
         transform = np.array(self.transform, dtype=np.float64)

@@ -432,7 +432,8 @@ def _tabletop() -> Scene:
     for kind, material, file, rank in position:
         spot = ((file + 0.5) * cell, board_y, nearest - (rank + 0.5) * cell)
         mesh = moved(pieces[kind], spot, (0, float(rng.uniform(-22, 22)), 0), 0.048)
-        nodes.append(Node(mesh, material=material))
+        name = f"{'white' if material is ivory else 'black'} {kind}" if kind in ("king", "queen") else None
+        nodes.append(Node(mesh, material=material, name=name))
         casters.append(mesh)
     middle = nearest - 4 * cell
     board = checker(rng, (1536, 1536), (8, 8), ("#e0bd87", "#7a4526"))
@@ -488,8 +489,8 @@ def _glass() -> Scene:
     nodes: list[Node] = []
     casters: list[Any] = []
 
-    def add(mesh: Any, material: Material, casts: bool = True) -> None:
-        nodes.append(Node(mesh, material=material))
+    def add(mesh: Any, material: Material, casts: bool = True, name: str | None = None) -> None:
+        nodes.append(Node(mesh, material=material, name=name))
         if casts:
             casters.append(mesh)
 
@@ -527,7 +528,7 @@ def _glass() -> Scene:
     ):
         add(moved(block((wide, tall, wide), 0.012), (px, tall / 2, pz)), white)
     add(moved(ring(0.085, 0.032, 72, 24), (-0.46, 1.097, -1.62), (90, 0, 20)), coral)
-    add(moved(knot(0.27, 0.062, 2, 3), (0.26, 1.33, -3.5), (0, 20, 90)), bronze)
+    add(moved(knot(0.27, 0.062, 2, 3), (0.26, 1.33, -3.5), (0, 20, 90)), bronze, name="bronze knot")
     add(moved(star(6, 0.24, 0.14, 0.55, 1.1), (-1.35, 0.85, -4.9)), cobalt)
     add(moved(ball(0.25), (1.5, 1.3, -5.4)), lime)
 
@@ -596,7 +597,7 @@ def _floating() -> Scene:
         mesh = moved(shapes[i % len(shapes)], spot, turn, min(1.0, 0.3 + 0.2 * depth))
         nodes.append(Node(mesh, material=paint(colors[i % len(colors)], (0.25, 0.4, 0.6)[i % 3])))
     subject = moved(knot(0.34, 0.075), (0.0, 0.0, -3.0), (25, 20, 0))
-    nodes.append(Node(subject, material=paint("#f4f1ea", 0.3)))
+    nodes.append(Node(subject, material=paint("#f4f1ea", 0.3), name="knot"))
     return Scene(
         "floating",
         merged(nodes),

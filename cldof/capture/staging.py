@@ -33,12 +33,17 @@ Vector = tuple[float, float, float]
 
 
 def merged(nodes: Sequence[Node]) -> tuple[Node, ...]:
-    """One node for each material: drawing takes time by the node as well as by the triangle."""
-    groups: dict[int, list[Node]] = {}
+    """One node for each material: drawing takes time by the node as well as by the triangle.
+
+    What has a name stays by itself.
+    """
+    groups: dict[object, list[Node]] = {}
     for node in nodes:
-        groups.setdefault(id(node.material), []).append(node)
+        groups.setdefault((id(node.material), node.name), []).append(node)
     return tuple(
-        group[0] if len(group) == 1 else Node(merge([node.mesh for node in group]), material=group[0].material)
+        group[0]
+        if len(group) == 1
+        else Node(merge([node.mesh for node in group]), material=group[0].material, name=group[0].name)
         for group in groups.values()
     )
 
