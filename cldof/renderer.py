@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from .errors import CldofError, DeviceError, InputError
 from .frame import LayeredFrame
-from .host.buffers import HostInput
+from .host.buffers import BufferPool, HostInput
 from .host.device import Device
 from .host.passes import Buffer, FrameProgram, Pass, Role, read, write
 from .host.profile import PassTiming, pass_timings
 from .host.scheduler import Batch, FrameRing, Submission, compile
 from .lens import Lens
 from .methods import FrameShape, Plan, make_method
+from .planner import SceneStats, bin_scale, buffer_sizes, read_stats, stats_passes
 
-__all__ = ["PendingResult", "Renderer", "Result"]
+__all__ = ["PendingResult", "Renderer", "Result", "frame_stats"]
 
 # Pass lists kept for the most recent kinds of frame (shape and plan structure); the pool passes their memory on.
 _KEPT_PROGRAMS = 4
@@ -64,7 +65,32 @@ class _DeviceFrame:
     arrays: dict[str, HostInput]  # color, and what else of the frame a method asked for
     preparation: Batch  # made inv_depth, and owns it
     ready: Any  # event
+    stats: _ComingStats
     last_use: Any = None  # event
+
+
+class _ComingStats:
+    """Statistics of a frame on their way to the host."""
+
+    def __init__(
+        self, frame: LayeredFrame, shape: FrameShape, preparation: Batch, pool: BufferPool, ready: Any
+    ) -> None:
+        self._shape, self._bins = shape, bin_scale(frame)
+        self._arrays = {name: np.empty(count, kind) for name, (count, kind) in buffer_sizes(shape).items()}
+        self._events = [pool.download(preparation.output(name), array, [ready]) for name, array in self._arrays.items()]
+        for event in self._events:
+            preparation.hold(event)
+        self._stats: SceneStats | None = None
+
+    def have_arrived(self) -> bool:
+        return self._stats is not None or all(int(event.command_execution_status) <= 0 for event in self._events)
+
+    def wait(self) -> SceneStats:
+        if self._stats is None:
+            for event in self._events:
+                event.wait()
+            self._stats = read_stats(self._shape, **self._arrays, first=self._bins[0], scale=self._bins[1])
+        return self._stats
 
 
 class PendingResult:
@@ -216,6 +242,19 @@ class Renderer:
             submission.batch.hold(download)
         return PendingResult(submission, download, image, plan, started, self.device.is_profiling)
 
+    def stats(self, frame: LayeredFrame) -> SceneStats:
+        """What the planner knows of a frame; uploads it, if need be, and waits for the answer.
+
+        Raises
+        ------
+        DeviceError
+            The device failed or has not enough memory.
+        """
+        with self._lock:
+            if self._closed:
+                raise DeviceError("This renderer is closed; make a new one.")
+            return self._upload(frame, FrameShape.of(frame)).stats.wait()
+
     @property
     def peak_device_bytes(self) -> int:
         """The most device memory held at a time; arrays that a CPU device reads in place are not counted."""
@@ -267,14 +306,18 @@ class Renderer:
             return held
         preparation = self._free_preparation(shape)
         if preparation is None:
-            preparation = compile(_inverse_depth_program(shape), self.device)
+            preparation = compile(_preparation_program(shape, self.device.traits.is_cpu), self.device)
         pool = self.device.pool
         color, depth = pool.to_device(frame.color, "upload color"), pool.to_device(frame.depth, "upload depth")
+        first, scale = bin_scale(frame)
         submission = preparation.submit(
-            {"color": color.buffer, "depth": depth.buffer}, wait_for=[*color.waits, *depth.waits]
+            {"color": color.buffer, "depth": depth.buffer},
+            {"first_bin": np.float32(first), "bin_scale": np.float32(scale)},
+            [*color.waits, *depth.waits],
         )
         pool.free_input(depth, submission.event)
-        held = _DeviceFrame(frame, shape, {"color": color}, preparation, submission.event)
+        stats = _ComingStats(frame, shape, preparation, pool, submission.event)
+        held = _DeviceFrame(frame, shape, {"color": color}, preparation, submission.event, stats)
         self._frames[key] = held
         return held
 
@@ -323,6 +366,31 @@ class Renderer:
             self._rings[key] = ring
         self._rings.move_to_end(key)
         return ring
+
+
+def frame_stats(device: Device, frame: LayeredFrame) -> SceneStats:
+    """Statistics of one frame, on a device of the caller's; a :class:`Renderer` has them for its own frames."""
+    shape = FrameShape.of(frame)
+    first, scale = bin_scale(frame)
+    pool = device.pool
+    inputs = {"color": pool.to_device(frame.color), "depth": pool.to_device(frame.depth)}
+    with compile(_preparation_program(shape, device.traits.is_cpu), device) as batch:
+        submission = batch.submit(
+            {name: one.buffer for name, one in inputs.items()},
+            {"first_bin": np.float32(first), "bin_scale": np.float32(scale)},
+            [event for one in inputs.values() for event in one.waits],
+        )
+        stats = _ComingStats(frame, shape, batch, pool, submission.event).wait()
+    for one in inputs.values():
+        pool.free_input(one)
+    return stats
+
+
+def _preparation_program(shape: FrameShape, is_cpu: bool) -> FrameProgram:
+    """What is made of a frame once: inverse depth, and statistics for the planner."""
+    program = _inverse_depth_program(shape)
+    buffers, passes = stats_passes(shape, is_cpu)
+    return FrameProgram.of([*program.buffers.values(), *buffers], [*program.passes, *passes])
 
 
 def _inverse_depth_program(shape: FrameShape) -> FrameProgram:
