@@ -76,7 +76,9 @@ class _ComingStats:
         self, frame: LayeredFrame, shape: FrameShape, preparation: Batch, pool: BufferPool, ready: Any
     ) -> None:
         self._shape, self._bins = shape, bin_scale(frame)
-        self._arrays = {name: np.empty(count, kind) for name, (count, kind) in buffer_sizes(shape).items()}
+        self._arrays: dict[str, NDArray[Any]] = {
+            name: np.empty(count, kind) for name, (count, kind) in buffer_sizes(shape).items()
+        }
         self._events = [pool.download(preparation.output(name), array, [ready]) for name, array in self._arrays.items()]
         for event in self._events:
             preparation.hold(event)
