@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .errors import InputError
+from .files import read_json
 
 __all__ = ["Camera"]
 
@@ -172,10 +172,5 @@ class Camera:
     @classmethod
     def load(cls, path: str | Path, width: int | None = None, height: int | None = None) -> Camera:
         """Read a JSON camera file: ``yfov_deg``, ``pose_camera_to_world`` (4x4, glTF axes), ``znear``, ``zfar``."""
-        try:
-            data = json.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"Cannot read camera file {path}: {error.strerror or error}.") from error
-        except ValueError as error:
-            raise InputError(f"Camera file {path} is not JSON: {error}.") from error
+        data = read_json(path, f"camera file {path}")
         return cls.from_dict(data, width, height)

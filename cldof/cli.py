@@ -27,7 +27,7 @@ import numpy as np
 from . import __version__
 from .camera import Camera
 from .errors import CldofError, DeviceError, FrameError, InputError
-from .files import atomic_write
+from .files import atomic_write, read_json
 from .focus import autofocus, focus_at, focus_on
 from .frame import LayeredFrame
 from .lens import Aperture, DiscAperture, GaussianAperture, ImageAperture, Lens, PolygonAperture
@@ -534,15 +534,12 @@ def _aperture(arguments: argparse.Namespace) -> Aperture:
 
 def _aperture_image(path: str) -> NDArray[np.float64]:
     """How much light each point of the aperture lets through: the linear luminance of a picture, on black."""
-    from PIL import Image
+    from .images import check_picture, linear_from_srgb, opened_picture
 
-    from .images import linear_from_srgb
-
-    try:
-        with Image.open(path) as picture:
-            flat = np.asarray(picture.convert("RGBA"), np.float64) / 255.0
-    except (OSError, ValueError, SyntaxError) as error:
-        raise InputError(f"Cannot read the aperture image {path}: {error}.") from error
+    what = f"the aperture image {path}"
+    check_picture(path, what)
+    with opened_picture(path, what) as picture:
+        flat = np.asarray(picture.convert("RGBA"), np.float64) / 255.0
     return np.asarray(linear_from_srgb(flat[..., :3]) @ (0.2126, 0.7152, 0.0722) * flat[..., 3])
 
 
@@ -647,10 +644,7 @@ def _sized(path: str, width: int | None, height: int | None) -> tuple[int | None
     """The size asked for, else the camera file's own, else the default."""
     if width is not None:
         return width, height
-    try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None, None  # Camera.load says what is wrong with the file
+    data = read_json(path, f"camera file {path}")
     has_size = isinstance(data, dict) and {"width", "height"} <= set(data)
     return (None, None) if has_size else _DEFAULT_SIZE
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .camera import Camera
 from .errors import FrameError, OutputError
-from .files import atomic_write
+from .files import atomic_write, parse_json, read_arrays
 
 __all__ = ["LayeredFrame"]
 
@@ -199,10 +198,8 @@ class LayeredFrame:
         try:
             if not os.path.isfile(path):
                 raise FrameError(f"Cannot read frame {path}: no such file.")
-            # Opened here: numpy leaves the file open when it turns out not to be a zip archive.
-            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as data:
-                header = json.loads(bytes(data["header"]).decode())
-                arrays = {name: data[name] for name in ("color", "depth", *_SURFACE_CHANNELS) if name in data}
+            arrays = read_arrays(path, ("header", "color", "depth", *_SURFACE_CHANNELS))
+            header = parse_json(bytes(arrays.pop("header")))
             if header["version"] != _FORMAT_VERSION:
                 raise FrameError(
                     f"Frame {path} has format version {header['version']}; this cldof reads {_FORMAT_VERSION}."
@@ -211,7 +208,7 @@ class LayeredFrame:
             color, depth = arrays.pop("color"), arrays.pop("depth")
         except FrameError:
             raise
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, MemoryError) as error:
+        except Exception as error:  # decoders of damaged files raise whatever comes
             raise FrameError(f"{path} is not a frame saved by cldof ({type(error).__name__}: {error}).") from error
         return cls(color, depth, camera, guard_px=guard_px, **arrays)
 

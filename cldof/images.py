@@ -14,19 +14,23 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import InputError, OutputError
-from .files import atomic_write
+from .errors import CldofError, InputError, OutputError
+from .files import atomic_write, parse_json, read_json
 
 __all__ = [
+    "check_picture",
     "check_writable",
     "linear_from_srgb",
+    "opened_picture",
     "read_metadata",
     "save_image",
     "srgb8_from_linear",
@@ -35,6 +39,10 @@ __all__ = [
 ]
 
 _METADATA_KEY = "cldof"
+# What pictures are read from, and how large they may be: Pillow knows formats that run other programs, and opens
+# pictures whose header promises any size.
+_READ_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "TGA", "PPM")
+_MOST_PIXELS = 1 << 27
 # Alpha below half a step of 8 bits is written as 0; only above it is colour divided by alpha.
 _ALPHA_THRESHOLD = 0.5 / 255.0
 
@@ -62,6 +70,54 @@ def srgb8_from_linear(image: ArrayLike) -> NDArray[np.uint8]:
     color = _to_bytes(srgb_from_linear(straight))
     coverage = _to_bytes(alpha)
     return color if coverage.min() == 255 else np.concatenate([color, coverage], axis=-1)
+
+
+def check_picture(source: Any, what: str, error_class: type[CldofError] = InputError) -> tuple[int, int]:
+    """Look at the header of a picture that somebody else made, before anything is decoded.
+
+    Parameters
+    ----------
+    source : path, binary stream or PIL.Image.Image
+    what : str
+        What it is, for messages.
+    error_class : type
+        What to raise.
+
+    Returns
+    -------
+    (int, int)
+        Width and height.
+    """
+    from PIL import Image
+
+    if isinstance(source, Image.Image):
+        size, kind = source.size, source.format
+    else:
+        with opened_picture(source, what, error_class) as picture:
+            size, kind = picture.size, picture.format
+    if kind not in (None, "MPO", *_READ_FORMATS):  # MPO: a JPEG with more than one picture
+        raise error_class(f"Cannot read {what}: it is a {kind} file; {', '.join(_READ_FORMATS)} are read.")
+    if size[0] * size[1] > _MOST_PIXELS:
+        raise error_class(f"Cannot read {what}: it has {size[0]}x{size[1]} pixels; at most {_MOST_PIXELS} are read.")
+    width, height = size
+    return int(width), int(height)
+
+
+@contextmanager
+def opened_picture(source: Any, what: str, error_class: type[CldofError] = InputError) -> Iterator[Any]:
+    """A picture of a known format; whatever goes wrong inside the block is `error_class`. Decodes nothing by itself."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # there is a limit of our own
+            with Image.open(source, formats=_READ_FORMATS) as picture:
+                yield picture
+    except CldofError:
+        raise
+    except Exception as error:  # decoders of damaged files raise whatever comes
+        reason = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+        raise error_class(f"Cannot read {what}: {reason}.") from error
 
 
 def supported_extensions() -> tuple[str, ...]:
@@ -147,23 +203,25 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
     suffix = source.suffix.lower()
     try:
         if suffix == ".png":
-            from PIL import Image
-
-            with Image.open(source) as picture:
-                text = picture.info.get(_METADATA_KEY, "{}")
+            with opened_picture(source, f"the metadata of {source}") as picture:
+                data = parse_json(picture.info.get(_METADATA_KEY, "{}"))
         elif suffix == ".exr":
             import OpenEXR
 
-            with OpenEXR.File(str(source)) as exr:
-                text = exr.header().get(_METADATA_KEY, "{}")
+            # Of the header alone: a damaged one may promise any number of pixels.
+            with OpenEXR.File(str(source), header_only=True) as exr:
+                data = parse_json(exr.header().get(_METADATA_KEY, "{}"))
         elif suffix == ".npy":
-            text = _sidecar(source).read_text(encoding="utf-8")
+            data = read_json(_sidecar(source), f"the metadata of {source}")
         else:
             raise InputError(f"{source} is not an image of ours; supported are {', '.join(supported_extensions())}.")
-        data: dict[str, Any] = json.loads(text)
+        if not isinstance(data, dict):
+            raise InputError(
+                f"Cannot read the metadata of {source}: it is a {type(data).__name__} and not a JSON object."
+            )
     except InputError:
         raise
-    except (OSError, RuntimeError, ValueError, SyntaxError) as error:
+    except Exception as error:  # decoders of damaged files raise whatever comes
         raise InputError(f"Cannot read the metadata of {source}: {error}.") from error
     return data
 
@@ -196,10 +254,10 @@ def _write_exr(target: Path, array: NDArray[Any], text: str) -> None:
 
 
 def _write_npy(target: Path, array: NDArray[np.float32], text: str) -> None:
-    with atomic_write(_sidecar(target)) as stream:
-        stream.write(text.encode() + b"\n")
-    with atomic_write(target) as stream:
+    # Both are whole before either appears.
+    with atomic_write(_sidecar(target)) as sidecar, atomic_write(target) as stream:
         np.save(stream, array.astype(np.float32, copy=False), allow_pickle=False)
+        sidecar.write(text.encode() + b"\n")
 
 
 _WRITERS: dict[str, Callable[[Path, NDArray[Any], str], None]] = {

@@ -25,7 +25,7 @@ from statistics import median, quantiles
 from typing import Any
 
 from ..errors import InputError
-from ..files import atomic_write
+from ..files import atomic_write, read_json
 
 __all__ = ["SCHEMA", "Record", "Row", "Times"]
 
@@ -172,7 +172,7 @@ class Record:
             If it cannot be read or is not one of ours.
         """
         try:
-            data = json.loads(Path(path).read_text(encoding="utf-8"))
+            data = read_json(path, str(path))
             if data["schema"] != SCHEMA:
                 raise InputError(f"{path} has schema {data['schema']!r}; this cldof reads {SCHEMA}.")
             rows = [Row.from_dict(row) for row in data["rows"]]
@@ -180,8 +180,6 @@ class Record:
             parts["references"] = _decoded(parts["references"])
         except InputError:
             raise
-        except OSError as error:
-            raise InputError(f"Cannot read {path}: {error.strerror or error}.") from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{path} holds no benchmark results ({type(error).__name__}: {error}).") from error
         return cls(rows={row.key: row for row in rows}, **parts)

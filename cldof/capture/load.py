@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..errors import SceneError
-from ..images import srgb_from_linear
+from ..files import parse_json
+from ..images import check_picture, srgb_from_linear
+from .gltf_check import check_gltf, file_within
 from .normals import merged_faces, with_crease_normals
 from .scene import Ambient, DirectionalLight, Gradient, Material, Node, PointLight, Scene
 
@@ -90,16 +92,15 @@ def load_scene(
             if suffix in (".glb", ".gltf"):
                 document, content = _tagged_gltf(path)
                 loaded = trimesh.load_scene(
-                    io.BytesIO(content),
-                    file_type=suffix[1:],
-                    resolver=trimesh.resolvers.FilePathResolver(str(path)),
-                    process=False,
+                    io.BytesIO(content), file_type=suffix[1:], resolver=_Folder(path), process=False
                 )
             else:
-                loaded = trimesh.load_scene(str(path), process=False)
+                loaded = trimesh.load_scene(str(path), resolver=_Folder(path), process=False)
             nodes = _nodes(loaded, document, path)
-    except SceneError:
-        raise
+    except SceneError as error:
+        if str(path) in str(error):
+            raise
+        raise SceneError(f"Cannot read scene {path}: {error}") from error
     except MemoryError as error:
         raise SceneError(f"Cannot read scene {path}: not enough memory.") from error
     except Exception as error:
@@ -140,6 +141,22 @@ def studio_lights(camera: Camera) -> tuple[DirectionalLight, ...]:
     )
 
 
+class _Folder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
+    """What a model may open beside itself: files of its own folder."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(str(path))
+        self._folder = path.absolute().parent
+
+    def get(self, name: str) -> bytes:
+        """Contents of a file."""
+        return file_within(self._folder, name).read_bytes()
+
+    def namespaced(self, namespace: str) -> _Folder:
+        """The same for a folder below."""
+        return _Folder(file_within(self._folder, namespace) / "_")
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep trimesh's log and the warnings of what it calls from the caller's terminal."""
@@ -168,12 +185,13 @@ def _tagged_gltf(path: Path) -> tuple[dict[str, Any], bytes]:
         text, rest = raw[20 : 20 + length], raw[20 + length :]
     else:
         text = raw
-    document = json.loads(text)
+    document = parse_json(text)
     if not isinstance(document, dict) or not str(document.get("asset", {}).get("version", "")).startswith("2"):
         raise SceneError(f"Cannot read scene {path}: it is not glTF 2.0.")
     missing = sorted(_UNREADABLE & set(document.get("extensionsRequired", ())))
     if missing:
         raise SceneError(f"Cannot read scene {path}: it needs {', '.join(missing)}. Export it without compression.")
+    check_gltf(document, memoryview(rest)[8:], path.absolute().parent)
     materials = [{**material, "name": f"{_TAG}{index}"} for index, material in enumerate(document.get("materials", ()))]
     tagged = json.dumps({**document, "materials": materials} if materials else document).encode()
     if is_binary:
@@ -268,12 +286,12 @@ def _gltf_material(data: dict[str, Any] | None, source: Any) -> Material:
     red, green, blue = (strength * float(v) for v in data.get("emissiveFactor", (0.0, 0.0, 0.0)))
     return Material(
         base_color=tuple(surface.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0))),
-        base_color_texture=getattr(source, "baseColorTexture", None),
+        base_color_texture=_texture(source, "baseColorTexture"),
         metallic=float(surface.get("metallicFactor", 1.0)),
         roughness=float(surface.get("roughnessFactor", 1.0)),
-        metallic_roughness_texture=getattr(source, "metallicRoughnessTexture", None),
+        metallic_roughness_texture=_texture(source, "metallicRoughnessTexture"),
         emissive=(red, green, blue),
-        emissive_texture=getattr(source, "emissiveTexture", None),
+        emissive_texture=_texture(source, "emissiveTexture"),
         alpha_mode=str(data.get("alphaMode", "OPAQUE")).lower(),
         alpha_cutoff=float(data.get("alphaCutoff", 0.5)),
         double_sided=bool(data.get("doubleSided", False)),
@@ -281,17 +299,26 @@ def _gltf_material(data: dict[str, Any] | None, source: Any) -> Material:
     )
 
 
+def _texture(source: Any, name: str) -> Any:
+    """An image of a material, decoded now, so that a damaged one is found here and not when it is drawn."""
+    image = getattr(source, name, None)
+    if image is not None:
+        check_picture(image, f"its {name}", SceneError)
+        image.load()
+    return image
+
+
 def _plain_material(source: Any, is_open: bool, has_colors: bool) -> Material:
     """For formats with simple materials or none: diffuse colour and image, shininess, opacity."""
     if not isinstance(source, trimesh.visual.material.SimpleMaterial):
         base = (1.0, 1.0, 1.0, 1.0) if has_colors else (0.5, 0.5, 0.5, 1.0)
-        image = getattr(source, "baseColorTexture", None)
+        image = _texture(source, "baseColorTexture")
         return Material(base_color=base, base_color_texture=image, double_sided=is_open)
     red, green, blue, alpha = (float(v) / 255.0 for v in source.diffuse)
     shininess = float(np.ravel(source.kwargs.get("ns", source.glossiness or 10.0))[0])
     return Material(
         base_color=(red, green, blue, alpha),
-        base_color_texture=source.image,
+        base_color_texture=_texture(source, "image"),
         roughness=(2.0 / (max(shininess, 0.0) + 2.0)) ** 0.25,
         alpha_mode="blend" if alpha < 1.0 else "opaque",
         double_sided=is_open or alpha < 1.0,

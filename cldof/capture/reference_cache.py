@@ -26,7 +26,7 @@ import trimesh
 
 from ..camera import Camera
 from ..errors import OutputError
-from ..files import atomic_write
+from ..files import atomic_write, parse_json, read_arrays
 from ..lens import Aperture, Lens
 from .accumulate import Reference, accumulate, view_plan
 from .peel import DepthPeeler, Progress
@@ -105,15 +105,14 @@ def scene_digest(scene: Scene) -> str:
 def _read(path: Path, key: str, shape: tuple[int, int, int]) -> Reference | None:
     """None for a file that is absent, damaged or of another key."""
     try:
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as data:
-            header = json.loads(bytes(data["header"]).decode())
-            image = data["image"]
+        arrays = read_arrays(path, ("header", "image"))
+        header, image = parse_json(bytes(arrays["header"])), arrays["image"]
         if header["key"] != key or image.shape != shape or image.dtype != np.float32:
             return None
         noise = header["noise_rms"]
         views, seconds = int(header["views"]), float(header["seconds"])
         return Reference(image, views, None if noise is None else float(noise), seconds, is_cached=True)
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError):
         return None
 
 
