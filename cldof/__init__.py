@@ -16,24 +16,30 @@ from .errors import (
 )
 from .frame import LayeredFrame
 from .lens import Aperture, DiscAperture, GaussianAperture, ImageAperture, Lens, PolygonAperture
+from .lighting import Ambient, DirectionalLight, Environment, Lighting, PointLight
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Ambient",
     "Aperture",
     "BuildError",
     "Camera",
     "CaptureError",
     "CldofError",
     "DeviceError",
+    "DirectionalLight",
     "DiscAperture",
+    "Environment",
     "FrameError",
     "GaussianAperture",
     "ImageAperture",
     "InputError",
     "LayeredFrame",
     "Lens",
+    "Lighting",
     "OutputError",
+    "PointLight",
     "PolygonAperture",
     "Renderer",
     "SceneError",

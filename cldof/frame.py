@@ -14,11 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 from .camera import Camera
 from .errors import FrameError, OutputError
 from .files import atomic_write, parse_json, read_arrays
+from .lighting import Environment, Lighting
 
 __all__ = ["LayeredFrame"]
 
 _FORMAT_VERSION = 1
-_SURFACE_CHANNELS = {"normal": 3, "albedo": 3, "shininess": None}
+_SURFACE_CHANNELS = {"normal": 3, "albedo": 3, "specular": 3, "shininess": None}
+# What shading from elsewhere needs.
+_SHADING = ("normal", "specular", "shininess")
 # Peels may repeat a depth (coplanar surfaces, sky behind sky) but never come nearer by more than rounding.
 _ORDER_TOLERANCE = 1e-6
 # A column whose layers let through less than this is closed: float32 rounding of blended alphas.
@@ -42,9 +45,12 @@ class LayeredFrame:
         Its size is that of the image, without the guard band.
     guard_px : int
         The arrays reach this many pixels beyond the image on each side, so that light from outside the frame is right.
-    normal, albedo, shininess : array_like, optional
-        Surface buffers for view-dependent shading: (M, H, W, 3) world-space unit normals, (M, H, W, 3) linear albedo,
-        (M, H, W) Phong exponents.
+    normal, albedo, specular, shininess : array_like, optional
+        Surface buffers: (M, H, W, 3) world-space unit normals (0 where there is none), (M, H, W, 3) diffuse
+        reflectance, (M, H, W, 3) specular reflectance straight on (0: matte), (M, H, W) Phong exponents; linear.
+    lighting : Lighting, optional
+        With normal, specular and shininess it lets methods shade what is glossy from the points of the lens. ``color``
+        is what the surfaces show the camera under this light; see docs/methods/multiview.md.
 
     Raises
     ------
@@ -61,7 +67,9 @@ class LayeredFrame:
         guard_px: int = 0,
         normal: ArrayLike | None = None,
         albedo: ArrayLike | None = None,
+        specular: ArrayLike | None = None,
         shininess: ArrayLike | None = None,
+        lighting: Lighting | None = None,
     ) -> None:
         if not isinstance(camera, Camera):
             raise FrameError(f"LayeredFrame needs a cldof.Camera; got {type(camera).__name__}.")
@@ -79,18 +87,29 @@ class LayeredFrame:
         if self.color.shape[0] != layers:
             raise FrameError(f"color has {self.color.shape[0]} layers but depth has {layers}; they must match.")
         self.surface: dict[str, NDArray[np.float32]] = {}
-        for name, value in (("normal", normal), ("albedo", albedo), ("shininess", shininess)):
+        given = {"normal": normal, "albedo": albedo, "specular": specular, "shininess": shininess}
+        for name, value in given.items():
             if value is not None:
                 array = _as_layers(value, name, _SURFACE_CHANNELS[name], shape)
                 if array.shape[0] != layers:
                     raise FrameError(f"{name} has {array.shape[0]} layers but depth has {layers}; they must match.")
                 _refuse(~np.isfinite(array), name, "NaN or infinite values")
                 self.surface[name] = array
+        self.lighting = lighting
         self._check_values()
         for array in (self.color, self.depth, *self.surface.values()):
             array.setflags(write=False)
 
     def _check_values(self) -> None:
+        if not isinstance(self.lighting, Lighting | None):
+            raise FrameError(f"lighting must be a cldof.Lighting; got {type(self.lighting).__name__}.")
+        missing = [name for name in _SHADING if name not in self.surface]
+        if self.lighting is not None and missing:
+            raise FrameError(f"A frame with lighting needs {', '.join(missing)} too; give them or leave lighting out.")
+        for name, low, high in (("specular", 0.0, 1.0), ("shininess", 0.0, np.inf)):
+            if name in self.surface:
+                array = self.surface[name]
+                _refuse((array < low) | (array > high), name, f"values outside of {low:g} to {high:g}")
         # Comparisons with NaN are false, so each test is written to be true for good values.
         if not (self.depth > 0.0).all():
             _refuse(np.isnan(self.depth), "depth", "NaN values; use inf where nothing is there")
@@ -152,6 +171,21 @@ class LayeredFrame:
         alpha = self.color[..., 3]
         return bool(((alpha > 0.0) & (alpha < 1.0 - _OPAQUE_TOLERANCE)).any())
 
+    @cached_property
+    def is_glossy(self) -> bool:
+        """True when surfaces look different from different points of the lens, and the frame knows how."""
+        return self.lighting is not None and bool((self.surface["specular"] > 0.0).any())
+
+    @cached_property
+    def inputs(self) -> dict[str, NDArray[np.float32]]:
+        """What a method may read beside colour and depth, by name: surface buffers, and the packed lighting."""
+        arrays = dict(self.surface)
+        if self.lighting is not None:
+            arrays["lighting"] = self.lighting.packed(self.camera, self.guard_px)
+            if self.lighting.environment is not None:
+                arrays["environment"] = self.lighting.environment.packed
+        return arrays
+
     def pinhole_image(self) -> NDArray[np.float32]:
         """All layers composited without any blur: what a lens of radius 0 sees. (H, W, 4), guard band cropped."""
         guard = self.guard_px
@@ -179,8 +213,16 @@ class LayeredFrame:
         OutputError
             If the file cannot be written.
         """
-        header = {"version": _FORMAT_VERSION, "camera": self.camera.to_dict(), "guard_px": self.guard_px}
+        header: dict[str, Any] = {
+            "version": _FORMAT_VERSION,
+            "camera": self.camera.to_dict(),
+            "guard_px": self.guard_px,
+        }
         arrays: dict[str, Any] = {"color": self.color, "depth": self.depth, **self.surface}
+        if self.lighting is not None:
+            header["lighting"] = self.lighting.to_dict()
+            if self.lighting.environment is not None:
+                arrays["environment"] = self.lighting.environment.image
         if Path(path).suffix != ".npz":
             raise OutputError(f"A frame is saved as .npz; {path} ends otherwise.")
         with atomic_write(path) as stream:
@@ -198,7 +240,7 @@ class LayeredFrame:
         try:
             if not os.path.isfile(path):
                 raise FrameError(f"Cannot read frame {path}: no such file.")
-            arrays = read_arrays(path, ("header", "color", "depth", *_SURFACE_CHANNELS))
+            arrays: dict[str, Any] = read_arrays(path, ("header", "color", "depth", "environment", *_SURFACE_CHANNELS))
             header = parse_json(bytes(arrays.pop("header")))
             if header["version"] != _FORMAT_VERSION:
                 raise FrameError(
@@ -206,6 +248,9 @@ class LayeredFrame:
                 )
             camera, guard_px = Camera.from_dict(header["camera"]), header["guard_px"]
             color, depth = arrays.pop("color"), arrays.pop("depth")
+            environment = Environment(arrays.pop("environment")) if "environment" in arrays else None
+            if "lighting" in header:
+                arrays["lighting"] = Lighting.from_dict(header["lighting"], environment)
         except FrameError:
             raise
         except Exception as error:  # decoders of damaged files raise whatever comes

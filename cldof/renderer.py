@@ -331,11 +331,11 @@ class Renderer:
                 buffers[name] = held.preparation.output(name)
                 continue
             if name not in held.arrays:
-                if name not in held.frame.surface:
+                if name not in held.frame.inputs:
                     raise InputError(
                         f"Method {self.method.name!r} needs the frame's {name} buffer; capture with surface=True."
                     )
-                held.arrays[name] = self.device.pool.to_device(held.frame.surface[name], f"upload {name}")
+                held.arrays[name] = self.device.pool.to_device(held.frame.inputs[name], f"upload {name}")
             buffers[name] = held.arrays[name].buffer
             waits += held.arrays[name].waits
         return buffers, waits

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "cldof"
-DATA = {"errors", "lens", "camera", "frame", "files", "images"}
+DATA = {"errors", "lens", "camera", "frame", "files", "images", "lighting"}
 
 # What each room may import of the project. A room is a module or a package right below cldof.
 ALLOWED = {

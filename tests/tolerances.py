@@ -37,6 +37,8 @@ TOLERANCES = {
     "pyramid": Tolerance(1e-4, outliers=2e-3),
     # float32 may round a sample to the pixel beside it
     "gather": Tolerance(1e-5, 1e-5, outliers=2e-2),
+    # the narrowest lobes (0.01 rad) are only so well resolved by a float32 cosine
+    "shading_split": Tolerance(2e-5, 1e-3, outliers=2e-3),
     "multiview_cone": Tolerance(2e-6),
     "multiview_extent": Tolerance(1e-5, 1e-5, outliers=1e-3),
     # float32 CoC against float64: a slot may fall into the next layer

@@ -90,6 +90,7 @@ def accumulate(
     seed: int = 0,
     progress: Progress | None = None,
     noise_floor: bool = True,
+    view_dependent: bool = True,
 ) -> Reference:
     """Depth of field by brute force.
 
@@ -116,6 +117,9 @@ def accumulate(
     noise_floor : bool
         Draw two independent halves, which tell the noise of their mean. Without, all views are points of one pattern,
         whose error is 1 to 2 dB smaller but unknown.
+    view_dependent : bool
+        Each view shades what is glossy as its own lens point sees it, as a lens does. False: as the lens centre sees
+        it, which judges the blur of a method that knows no more than that.
 
     Returns
     -------
@@ -133,7 +137,7 @@ def accumulate(
     with peeler.current():
         for points, shifts in plan:
             part = np.zeros((camera.height, camera.width, 4))
-            for image in _draw(peeler, scene, camera, lens, points, shifts):
+            for image in _draw(peeler, scene, camera, lens, points, shifts, view_dependent):
                 part += image  # float32 into float64 in place: 2 ms a megapixel, a few per cent of drawing a view
                 done += 1
                 if progress is not None:
@@ -192,6 +196,7 @@ def _draw(
     lens: Lens,
     points: NDArray[np.float64],
     shifts: NDArray[np.float64],
+    view_dependent: bool,
 ) -> Iterator[NDArray[np.float32]]:
     """Draw view after view, inside :meth:`DepthPeeler.current`. An image is overwritten by the next."""
     from .draw import PassOptions, View
@@ -202,7 +207,7 @@ def _draw(
     image = np.empty((camera.height, camera.width, 4), np.float32)
     layer = np.empty_like(image) if layers > 1 else image
     for point, shift in zip(points, shifts, strict=True):
-        view = View(camera, (point[0], point[1]), lens.focus_distance_m, (shift[0], shift[1]))
+        view = View(camera, (point[0], point[1]), lens.focus_distance_m, (shift[0], shift[1]), view_dependent)
         is_empty = True
         for target in peeler.passes(scene, view, layers, options):
             if is_empty:

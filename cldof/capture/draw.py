@@ -23,7 +23,7 @@ from ..errors import CaptureError, SceneError
 from ..images import linear_from_srgb
 from ..lens import Lens
 from .gl_context import import_pyrender
-from .scene import DirectionalLight, Gradient, Node, PointLight, Scene
+from .scene import Environment, Gradient, Node, Scene
 
 pyrender: Any = import_pyrender()
 
@@ -33,7 +33,9 @@ from OpenGL.error import Error as GLError  # noqa: E402
 __all__ = ["PassOptions", "SceneRenderer", "Target", "View", "opengl_errors"]
 
 _SHADER_HEADER = "#version 330 core\n"
-_PREVIOUS_UNIT, _BASE_UNIT, _EMISSIVE_UNIT, _ROUGHNESS_UNIT = 0, 1, 2, 3
+_PREVIOUS_UNIT, _BASE_UNIT, _EMISSIVE_UNIT, _ROUGHNESS_UNIT, _ENVIRONMENT_UNIT = 0, 1, 2, 3, 4
+# Texels in a row, as shaders/environment.glsl has it.
+_ENVIRONMENT_ROW = 512
 
 
 @contextmanager
@@ -60,12 +62,15 @@ class View:
     focus_distance_m : float
     jitter_px : (x, y)
         Shift of the sample inside the pixel, x right and y down.
+    shade_from_lens_point : bool
+        What surfaces mirror is what the lens point sees; False: what the lens centre sees, from everywhere.
     """
 
     camera: Camera
     lens_point: tuple[float, float] = (0.0, 0.0)
     focus_distance_m: float = math.inf
     jitter_px: tuple[float, float] = (0.0, 0.0)
+    shade_from_lens_point: bool = False
 
     def uniforms(self) -> dict[str, Any]:
         """What projection.glsl and the shaders that include it need, worked out in float64."""
@@ -74,6 +79,9 @@ class View:
         focal = camera.focal_px / half * (1.0, -1.0)  # y down in the window: row 0 of a read-back is the top row
         in_focus = math.isfinite(self.focus_distance_m)
         shift = focal * self.lens_point / (self.focus_distance_m if in_focus else 1.0)
+        eye = camera.pose[:3, 3]
+        if self.shade_from_lens_point:
+            eye = eye + camera.pose[:3, :2] @ self.lens_point
         near, far = camera.near, camera.far
         depth_range = (near, 0.0) if math.isinf(far) else (near * far / (far - near), near / (far - near))
         return {
@@ -83,7 +91,8 @@ class View:
             "lens_point": np.array(self.lens_point),
             "focus": np.array([self.focus_distance_m, 1.0] if in_focus else [1.0, 0.0]),
             "jitter": -np.array(self.jitter_px) / half,
-            "eye": camera.pose[:3, 3],
+            "eye": eye,
+            "to_world": camera.pose[:3, :3],
             "up": camera.pose[1, :3],
         }
 
@@ -94,7 +103,7 @@ class PassOptions:
 
     ``lens_reach_m``: back faces of single-sided materials are dropped unless a lens point within this radius sees their
     front; 0 drops all that this view sees from behind, None keeps them all. ``stop_at_opaque``: nothing is peeled
-    behind an opaque fragment. ``surface``: write normals and albedo too.
+    behind an opaque fragment. ``surface``: write the surface buffers too.
     """
 
     lens_reach_m: float | None = None
@@ -113,7 +122,7 @@ class Target:
     def __init__(self, width: int, height: int, surface: bool) -> None:
         self.width, self.height = width, height
         formats = [(gl.GL_RGBA32F, gl.GL_RGBA), (gl.GL_R32F, gl.GL_RED)]
-        formats += [(gl.GL_RGBA32F, gl.GL_RGBA)] * 2 if surface else []
+        formats += [(gl.GL_RGBA32F, gl.GL_RGBA)] * 3 if surface else []
         self.textures: list[int] = []
         self.framebuffer = gl.glGenFramebuffers(1)
         gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self.framebuffer)
@@ -152,7 +161,7 @@ class Target:
         gl.glClear(gl.GL_COLOR_BUFFER_BIT | gl.GL_DEPTH_BUFFER_BIT)
 
     def read(self, index: int, out: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Copy attachment ``index`` (0 colour, 1 inverse depth, 2 normal, 3 albedo) into a C-contiguous array."""
+        """Copy an attachment (its location in shaders/peel.glsl) into a C-contiguous array."""
         gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self.framebuffer)
         gl.glReadBuffer(gl.GL_COLOR_ATTACHMENT0 + index)
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
@@ -212,7 +221,7 @@ class _Program:
                     upload(location, array.size // array.shape[-1], array)
 
 
-_MATRICES = {"model", "model_view", "normal_matrix"}
+_MATRICES = {"model", "model_view", "normal_matrix", "to_world"}
 _SCALAR_ARRAYS = {"point_cone_inner"}
 
 
@@ -289,6 +298,7 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
         self._items: list[_Item] = []
         self._uploads: dict[tuple[int, int], tuple[Any, Any, Any]] = {}  # (mesh, material) ids -> them, pyrender mesh
         self._textures: dict[tuple[int, bool], tuple[Any, _Texture]] = {}  # (image id, is colour) -> image, texture
+        self._environments: dict[int, tuple[Environment, int]] = {}  # id -> it, its texture
         self._programs: dict[tuple[Any, ...], _Program] = {}
         self._empty_vertex_array = gl.glGenVertexArrays(1)
         self._query = int(np.ravel(gl.glGenQueries(1))[0])  # an array in some PyOpenGL versions
@@ -326,7 +336,31 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
         self._scene = None
         with opengl_errors("uploading meshes and textures"):
             self._update_context(graph, 0)
+            self._load_environments(scene)
         self._uploads, self._textures, self._items, self._scene = uploads, textures, items, scene
+
+    def _load_environments(self, scene: Scene) -> None:
+        wanted = {id(one): one for one in (scene.environment, scene.background) if isinstance(one, Environment)}
+        for key in self._environments.keys() - wanted.keys():
+            gl.glDeleteTextures([self._environments.pop(key)[1]])
+        for key in wanted.keys() - self._environments.keys():
+            packed = wanted[key].packed
+            rows = -(-len(packed) // _ENVIRONMENT_ROW)
+            texels = np.zeros((rows * _ENVIRONMENT_ROW, 4), np.float32)
+            texels[: len(packed)] = packed
+            texture = gl.glGenTextures(1)
+            self._bind_environment(texture)
+            gl.glTexImage2D(
+                gl.GL_TEXTURE_2D, 0, gl.GL_RGBA32F, _ENVIRONMENT_ROW, rows, 0, gl.GL_RGBA, gl.GL_FLOAT, texels
+            )
+            for name in (gl.GL_TEXTURE_MIN_FILTER, gl.GL_TEXTURE_MAG_FILTER):
+                gl.glTexParameteri(gl.GL_TEXTURE_2D, name, gl.GL_NEAREST)
+            self._environments[key] = wanted[key], int(texture)
+
+    @staticmethod
+    def _bind_environment(texture: int) -> None:
+        gl.glActiveTexture(gl.GL_TEXTURE0 + _ENVIRONMENT_UNIT)
+        gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
 
     def draw(self, view: View, target: Target, previous: Target | None, options: PassOptions) -> bool:
         """Draw the loaded scene's next layer behind ``previous`` (None: the first); False if nothing was left to draw.
@@ -348,12 +382,17 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
                 "base_texture": _BASE_UNIT,
                 "emissive_texture": _EMISSIVE_UNIT,
                 "metallic_roughness_texture": _ROUGHNESS_UNIT,
+                "environment": _ENVIRONMENT_UNIT,
                 "first_layer": previous is None,
                 "zero_to_one": self._zero_to_one,
                 "lens_reach": -1.0 if options.lens_reach_m is None else float(options.lens_reach_m),
                 "stop_at_opaque": options.stop_at_opaque,
             }
             surface = {"SURFACE": 1} if options.surface else {}
+            around = {}
+            if scene.environment is not None:
+                around = {"ENVIRONMENT": 1}
+                self._bind_environment(self._environments[id(scene.environment)][1])
             prepared: set[_Program] = set()
             to_camera = np.linalg.inv(view.camera.pose)
             # Front to back, so that the depth test spares shading; ties keep the scene's order.
@@ -362,15 +401,12 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
             try:
                 for index in np.argsort(depths, kind="stable"):
                     item = self._items[index]
-                    program = self._program("surface", {**item.defines, **surface}, prepared, common)
+                    program = self._program("surface", {**item.defines, **surface, **around}, prepared, common)
                     program.set(item.uniforms)
                     program.set({"model_view": to_camera @ item.transform})
                     self._draw_item(item, cull=options.lens_reach_m == 0.0 and "DOUBLE_SIDED" not in item.defines)
                 if scene.background is not None:
-                    sky = scene.background
-                    top, bottom = (sky.top, sky.bottom) if isinstance(sky, Gradient) else (sky, sky)
-                    program = self._program("sky", surface, prepared, common)
-                    program.set({"sky_top": np.array(top), "sky_bottom": np.array(bottom)})
+                    self._prepare_sky(scene.background, surface, prepared, common)
                     gl.glDepthFunc(gl.GL_GEQUAL)
                     gl.glDisable(gl.GL_CULL_FACE)
                     gl.glBindVertexArray(self._empty_vertex_array)
@@ -380,6 +416,20 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
                 gl.glEndQuery(gl.GL_ANY_SAMPLES_PASSED)
             gl.glUseProgram(0)
             return bool(np.ravel(gl.glGetQueryObjectuiv(self._query, gl.GL_QUERY_RESULT))[0])
+
+    def _prepare_sky(
+        self,
+        sky: tuple[float, float, float] | Gradient | Environment,
+        defines: dict[str, int],
+        prepared: set[_Program],
+        common: dict[str, Any],
+    ) -> None:
+        if isinstance(sky, Environment):
+            self._program("sky", {**defines, "ENVIRONMENT": 1}, prepared, common)
+            self._bind_environment(self._environments[id(sky)][1])
+            return
+        top, bottom = (sky.top, sky.bottom) if isinstance(sky, Gradient) else (sky, sky)
+        self._program("sky", defines, prepared, common).set({"sky_top": np.array(top), "sky_bottom": np.array(bottom)})
 
     def _set_state(self, target: Target, previous: Target | None) -> None:
         for capability in (gl.GL_BLEND, gl.GL_MULTISAMPLE, gl.GL_CULL_FACE, gl.GL_SCISSOR_TEST, gl.GL_DITHER):
@@ -420,6 +470,9 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
             gl.glDeleteProgram(program.id)
         gl.glDeleteVertexArrays(1, [self._empty_vertex_array])
         gl.glDeleteQueries(1, [self._query])
+        for _, texture in self._environments.values():
+            gl.glDeleteTextures([texture])
+        self._environments = {}
         self._programs, self._items, self._uploads, self._textures, self._scene = {}, [], {}, {}, None
 
 
@@ -511,24 +564,17 @@ def _linear_colors(colors: Any) -> NDArray[np.float32] | None:
 
 
 def _light_uniforms(scene: Scene) -> dict[str, Any]:
-    directional = [light for light in scene.lights if isinstance(light, DirectionalLight)]
-    points = [light for light in scene.lights if isinstance(light, PointLight)]
+    parts = scene.lighting.arrays()
     values: dict[str, Any] = {
         "ambient_sky": np.array(scene.ambient.sky),
         "ambient_ground": np.array(scene.ambient.ground),
-        "directional_count": len(directional),
-        "point_count": len(points),
+        "directional_count": len(parts["directional_color"]),
+        "point_count": len(parts["point_color"]),
     }
-    if directional:
-        towards = -np.array([light.direction for light in directional])
-        values["directional_to_light"] = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-        values["directional_color"] = np.array([light.color for light in directional])
-    if points:
-        values["point_position"] = np.array([light.position for light in points])
-        values["point_color"] = np.array([light.color for light in points])
-        axes = np.array([light.direction or (0.0, 0.0, 0.0) for light in points])
-        lengths = np.linalg.norm(axes, axis=1, keepdims=True)
-        cones = np.cos(np.radians([light.cone_deg for light in points]))
-        values["point_cone"] = np.concatenate([axes / np.where(lengths > 0.0, lengths, 1.0), cones[:, 1:]], axis=1)
-        values["point_cone_inner"] = cones[:, 0]
+    if values["directional_count"]:
+        values |= {name: parts[name] for name in ("directional_to_light", "directional_color")}
+    if values["point_count"]:
+        values |= {name: parts[name] for name in ("point_position", "point_color")}
+        values["point_cone"] = np.concatenate([parts["point_axis"], parts["point_cone"][:, 1:]], axis=1)
+        values["point_cone_inner"] = parts["point_cone"][:, 0]
     return values

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -95,7 +95,7 @@ class DepthPeeler:
         guard_px : int
             Pixels to capture beyond the image on each side.
         surface : bool
-            Fill the frame's ``surface`` buffers: normal, albedo and shininess.
+            Fill the frame's surface buffers and lighting, with which methods shade from the points of the lens.
         progress : callable, optional
             Called with (layers done, layers at most).
 
@@ -123,7 +123,7 @@ class DepthPeeler:
         options = PassOptions.for_layers(lens, surface)
         shape = (layers, view.camera.height, view.camera.width)
         color, depth = np.empty((*shape, 4), np.float32), np.empty(shape, np.float32)
-        extra = np.empty((2, *shape, 4), np.float32) if surface else None
+        extra = np.empty((3, *shape, 4), np.float32) if surface else None
         count = 0
         with self._context.current():
             for target in self.passes(scene, view, layers, options):
@@ -132,8 +132,8 @@ class DepthPeeler:
                 with np.errstate(divide="ignore"):
                     np.divide(np.float32(1.0), inverse, out=inverse)
                 if extra is not None:
-                    target.read(2, extra[0, count])
-                    target.read(3, extra[1, count])
+                    for index in range(3):
+                        target.read(2 + index, extra[index, count])
                 count += 1
                 if progress is not None:
                     progress(count, layers)
@@ -141,10 +141,11 @@ class DepthPeeler:
             color[0], depth[0], count = 0.0, np.inf, 1
             if extra is not None:
                 extra[:, 0] = 0.0
-        buffers = {}
+        buffers: dict[str, Any] = {}
         if extra is not None:
-            normal, albedo = extra[:, :count]
-            buffers = {"normal": normal[..., :3], "albedo": albedo[..., :3], "shininess": normal[..., 3]}
+            normal, albedo, specular = extra[:, :count]
+            buffers = {"normal": normal[..., :3], "shininess": normal[..., 3]}
+            buffers |= {"albedo": albedo[..., :3], "specular": specular[..., :3], "lighting": scene.lighting}
         return LayeredFrame(color[:count], depth[:count], camera, guard_px=guard_px, **buffers)
 
     @contextmanager

@@ -30,7 +30,7 @@ from ..files import atomic_write, parse_json, read_arrays
 from ..lens import Aperture, Lens
 from .accumulate import Reference, accumulate, view_plan
 from .peel import DepthPeeler, Progress
-from .scene import Scene
+from .scene import Environment, Scene
 
 __all__ = ["ReferenceCache", "scene_digest"]
 
@@ -38,7 +38,15 @@ _FORMAT_VERSION = 1
 # Fields of a scene that a picture taken through a given camera and lens does not depend on.
 _NOT_SEEN = {"name", "camera", "focus_distance_m", "aperture_radius_m", "view_from_deg"}
 # What decides the pixels, beside every shader.
-_SOURCES = ("lens.py", "camera.py", "images.py", "capture/accumulate.py", "capture/draw.py", "capture/peel.py")
+_SOURCES = (
+    "lens.py",
+    "camera.py",
+    "images.py",
+    "lighting.py",
+    "capture/accumulate.py",
+    "capture/draw.py",
+    "capture/peel.py",
+)
 
 
 class ReferenceCache:
@@ -66,6 +74,7 @@ class ReferenceCache:
         seed: int = 0,
         progress: Progress | None = None,
         noise_floor: bool = True,
+        view_dependent: bool = True,
     ) -> Reference:
         """As :func:`cldof.capture.accumulate.accumulate`, read from disk where it was drawn before.
 
@@ -83,13 +92,16 @@ class ReferenceCache:
                 "camera": camera.to_dict(),
                 "lens": [lens.aperture_radius_m, lens.focus_distance_m],
                 "plan": plan,  # follows from views, aperture, jitter and seed
+                "view_dependent": view_dependent,
             }
         )
         path = self.folder / f"{key[:40]}.npz"
         found = _read(path, key, (camera.height, camera.width, 4))
         if found is not None:
             return found
-        made = accumulate(peeler, scene, camera, lens, views, shape, jitter, seed, progress, noise_floor)
+        made = accumulate(
+            peeler, scene, camera, lens, views, shape, jitter, seed, progress, noise_floor, view_dependent
+        )
         try:
             _write(path, key, made)
         except (OutputError, OSError) as error:
@@ -187,6 +199,8 @@ def _parts(value: Any) -> dict[str, Any]:
         }
     if hasattr(value, "tobytes") and hasattr(value, "mode"):  # a PIL image
         return {"mode": value.mode, "size": tuple(value.size), "pixels": value.convert("RGBA").tobytes()}
+    if isinstance(value, Environment):
+        return {"image": value.image}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.name not in _NOT_SEEN}
     raise TypeError(f"{type(value).__name__} has no digest; cldof.capture.reference_cache must learn about it.")

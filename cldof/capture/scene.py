@@ -8,7 +8,6 @@ uploads nothing new. So treat them as immutable and make new ones for new conten
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -19,28 +18,15 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..errors import SceneError
+from ..lighting import Ambient, DirectionalLight, Environment, Lighting, PointLight, checked_color
 
-__all__ = ["Ambient", "DirectionalLight", "Gradient", "Material", "Node", "PointLight", "Scene"]
+__all__ = ["Ambient", "DirectionalLight", "Environment", "Gradient", "Material", "Node", "PointLight", "Scene"]
 
 # A scene without a camera is seen through this angle and fills this share of the image.
 _FRAMING_FOV_DEG, _FRAMING_FILL = 30.0, 0.84
 
 RGB = tuple[float, float, float]
 RGBA = tuple[float, float, float, float]
-
-
-def _color(value: Iterable[float], name: str, channels: int) -> tuple[float, ...]:
-    color = tuple(float(v) for v in value)
-    if len(color) != channels or not all(0.0 <= v < math.inf for v in color):
-        raise SceneError(f"{name} is {color}; it must be {channels} finite numbers of linear light, none below 0.")
-    return color
-
-
-def _vector(value: Iterable[float], name: str) -> RGB:
-    x, y, z = (float(v) for v in value)
-    if not all(math.isfinite(v) for v in (x, y, z)):
-        raise SceneError(f"{name} is ({x}, {y}, {z}); it must be finite.")
-    return x, y, z
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +67,8 @@ class Material:
     unlit: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "base_color", _color(self.base_color, "Material base_color", 4))
-        object.__setattr__(self, "emissive", _color(self.emissive, "Material emissive", 3))
+        object.__setattr__(self, "base_color", checked_color(self.base_color, "Material base_color", 4))
+        object.__setattr__(self, "emissive", checked_color(self.emissive, "Material emissive", 3))
         if self.alpha_mode not in ("opaque", "mask", "blend"):
             raise SceneError(f"Material alpha_mode is {self.alpha_mode!r}; use 'opaque', 'mask' or 'blend'.")
 
@@ -117,52 +103,6 @@ class Node:
 
 
 @dataclass(frozen=True)
-class DirectionalLight:
-    """Parallel light travelling along ``direction``; ``color`` is its irradiance over pi, so 1 on white gives 1."""
-
-    direction: RGB
-    color: RGB = (1.0, 1.0, 1.0)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "direction", _vector(self.direction, "DirectionalLight direction"))
-        object.__setattr__(self, "color", _color(self.color, "DirectionalLight color", 3))
-        if not any(self.direction):
-            raise SceneError("DirectionalLight direction is (0, 0, 0); it must point somewhere.")
-
-
-@dataclass(frozen=True)
-class PointLight:
-    """Light from ``position``, falling with the square of distance; ``color`` is what 1 m away gives on white.
-
-    With a ``direction`` it is a spot light: full inside the first of ``cone_deg`` (half angles), none outside the
-    second.
-    """
-
-    position: RGB
-    color: RGB = (1.0, 1.0, 1.0)
-    direction: RGB | None = None
-    cone_deg: tuple[float, float] = (0.0, 45.0)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "position", _vector(self.position, "PointLight position"))
-        object.__setattr__(self, "color", _color(self.color, "PointLight color", 3))
-        if self.direction is not None:
-            object.__setattr__(self, "direction", _vector(self.direction, "PointLight direction"))
-
-
-@dataclass(frozen=True)
-class Ambient:
-    """Light from everywhere: ``sky`` on surfaces facing up (+y), ``ground`` on those facing down, blended between."""
-
-    sky: RGB = (0.25, 0.25, 0.25)
-    ground: RGB = (0.25, 0.25, 0.25)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "sky", _color(self.sky, "Ambient sky", 3))
-        object.__setattr__(self, "ground", _color(self.ground, "Ambient ground", 3))
-
-
-@dataclass(frozen=True)
 class Gradient:
     """A sky at infinity: ``top`` straight up (+y), ``bottom`` straight down, linear in the sine of elevation."""
 
@@ -170,8 +110,8 @@ class Gradient:
     bottom: RGB
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "top", _color(self.top, "Gradient top", 3))
-        object.__setattr__(self, "bottom", _color(self.bottom, "Gradient bottom", 3))
+        object.__setattr__(self, "top", checked_color(self.top, "Gradient top", 3))
+        object.__setattr__(self, "bottom", checked_color(self.bottom, "Gradient bottom", 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,8 +127,10 @@ class Scene:
     lights : sequence of DirectionalLight and PointLight
         At most 8 of each kind.
     ambient : Ambient
-    background : None, RGB or Gradient
+    background : None, RGB, Gradient or Environment
         None is a transparent void; else a sky at infinity, in linear light.
+    environment : Environment, optional
+        Lights the scene in place of ``ambient``, and is what glossy surfaces mirror.
     focus_distance_m, aperture_radius_m : float, optional
         Suggestions of whoever made the scene.
     unlit : bool
@@ -202,23 +144,27 @@ class Scene:
     camera: Camera | None = None
     lights: tuple[DirectionalLight | PointLight, ...] = ()
     ambient: Ambient = field(default_factory=Ambient)
-    background: RGB | Gradient | None = None
+    background: RGB | Gradient | Environment | None = None
     focus_distance_m: float | None = None
     aperture_radius_m: float | None = None
     unlit: bool = False
     view_from_deg: tuple[float, float] = (30.0, 14.0)
+    environment: Environment | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", tuple(self.nodes))
         object.__setattr__(self, "lights", tuple(self.lights))
-        if self.background is not None and not isinstance(self.background, Gradient):
-            object.__setattr__(self, "background", _color(self.background, "Scene background", 3))
-        for kind in (DirectionalLight, PointLight):
-            count = sum(isinstance(light, kind) for light in self.lights)
-            if count > 8:
-                raise SceneError(
-                    f"Scene {self.name!r} has {count} lights of kind {kind.__name__}; at most 8 are drawn."
-                )
+        if self.background is not None and not isinstance(self.background, Gradient | Environment):
+            object.__setattr__(self, "background", checked_color(self.background, "Scene background", 3))
+        try:
+            Lighting(self.lights, self.ambient, self.environment)
+        except SceneError as error:
+            raise SceneError(f"Scene {self.name!r}: {error}") from None
+
+    @cached_property
+    def lighting(self) -> Lighting:
+        """All that lights the scene."""
+        return Lighting(self.lights, self.ambient, self.environment)
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:

@@ -25,7 +25,8 @@ class FrameShape(NamedTuple):
     guard_px: int
     is_opaque: bool
     has_glass: bool
-    surface: tuple[str, ...] = ()  # names of the surface buffers that the frame has
+    surface: tuple[str, ...] = ()  # what the frame has beside colour and depth: LayeredFrame.inputs
+    is_glossy: bool = False
 
     @classmethod
     def of(cls, frame: LayeredFrame) -> FrameShape:
@@ -37,7 +38,8 @@ class FrameShape(NamedTuple):
             frame.guard_px,
             frame.is_opaque,
             frame.has_glass,
-            tuple(sorted(frame.surface)),
+            tuple(sorted(frame.inputs)),
+            frame.is_glossy,
         )
 
     @property
@@ -91,9 +93,9 @@ class Method(Protocol):
     """A depth-of-field method: turns lens and frame into passes, and owns no OpenCL object.
 
     Passes may read the inputs ``color`` (float[layers][height][width][4]) and ``inv_depth``
-    (float[layers][height][pitch], see kernels/frame.cl), and of frames that have them ``normal`` and ``albedo``
-    (float[layers][height][width][3]) and ``shininess`` (float[layers][height][width]). They write the output ``image``
-    (float[output height][output width][4]).
+    (float[layers][height][pitch], see kernels/frame.cl), and of frames that have them ``normal``, ``albedo``,
+    ``specular`` (float[layers][height][width][3]), ``shininess`` (float[layers][height][width]), ``lighting`` and
+    ``environment`` (see kernels/shading.clh). They write the output ``image`` (float[output height][output width][4]).
     """
 
     name: str

@@ -17,6 +17,7 @@ from cldof.capture.peel import DepthPeeler
 from cldof.capture.reference_cache import ReferenceCache, scene_digest
 from cldof.capture.scene import Ambient, DirectionalLight, Gradient, Material, Node, PointLight, Scene
 from cldof.lens import ImageAperture, PolygonAperture
+from tests.shaded import environment
 
 from .conftest import camera_at, flat, quad
 
@@ -75,6 +76,9 @@ def test_whatever_the_image_depends_on_asks_for_a_new_one(peeler: DepthPeeler, c
         {"seed": 1},
         {"jitter": True},
         {"noise_floor": False},
+        {"view_dependent": False},
+        {"scene": a_scene(environment=environment())},
+        {"scene": a_scene(background=environment())},
     ]
     for count, change in enumerate(changes, 1):
         made = cache.accumulate(peeler, **(base | change))

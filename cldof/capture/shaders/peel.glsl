@@ -4,7 +4,8 @@ layout(location = 0) out vec4 out_color;           // linear light, premultiplie
 layout(location = 1) out float out_inverse_depth;  // 1/z in 1/m; 0 = infinity: sky, or nothing
 #ifdef SURFACE
 layout(location = 2) out vec4 out_normal;          // world-space unit normal, Phong exponent
-layout(location = 3) out vec4 out_albedo;          // linear
+layout(location = 3) out vec4 out_albedo;          // diffuse reflectance, linear
+layout(location = 4) out vec4 out_specular;        // specular reflectance straight on, linear; 0 = matte
 #endif
 
 uniform sampler2D previous;  // inverse depth of the layer before

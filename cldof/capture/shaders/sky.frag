@@ -1,8 +1,12 @@
 // sky.frag: fills the first slot that no surface took; a pixel that already ended stays empty.
-// Defines: SURFACE.
+// Defines: SURFACE, ENVIRONMENT.
 
 #include "peel.glsl"
 #include "projection.glsl"
+#ifdef ENVIRONMENT
+#include "environment.glsl"
+uniform mat3 to_world;  // camera axes to world
+#endif
 
 in vec2 ndc;
 
@@ -12,11 +16,16 @@ uniform vec3 sky_bottom;
 
 void main() {
     if (!first_layer && previous_inverse_depth() == 0.0) discard;
-    float height = dot(normalize(direction_at(ndc)), up);
-    out_color = vec4(mix(sky_bottom, sky_top, 0.5 + 0.5 * height), 1.0);
+    vec3 direction = direction_at(ndc);
+#ifdef ENVIRONMENT
+    out_color = vec4(environment_level(to_world * direction, 0), 1.0);
+#else
+    out_color = vec4(mix(sky_bottom, sky_top, 0.5 + 0.5 * dot(normalize(direction), up)), 1.0);
+#endif
     out_inverse_depth = 0.0;
 #ifdef SURFACE
     out_normal = vec4(0.0);
     out_albedo = vec4(0.0);
+    out_specular = vec4(0.0);
 #endif
 }

@@ -1,6 +1,5 @@
 // surface.frag: one fragment of one peel: peel test, back faces, alpha, light.
-// Defines: BASE_TEXTURE, EMISSIVE_TEXTURE, ROUGHNESS_TEXTURE, LIT, MASK, BLEND, DOUBLE_SIDED, SURFACE.
-// Shading sees the lens centre from every lens point, so that layers and lens views show the same colours.
+// Defines: BASE_TEXTURE, EMISSIVE_TEXTURE, ROUGHNESS_TEXTURE, LIT, MASK, BLEND, DOUBLE_SIDED, SURFACE, ENVIRONMENT.
 
 #include "peel.glsl"
 #include "lighting.glsl"
@@ -84,8 +83,15 @@ void main() {
     out_inverse_depth = stop_at_opaque && alpha >= 1.0 ? 0.0 : inverse_depth;
 #ifdef SURFACE
     // Phong exponent of the GGX lobe's width: alpha = roughness^2, n = 2 / alpha^2 - 2.
-    float width = max(rough * rough, 1e-2);
-    out_normal = vec4(normal, max(2.0 / (width * width) - 2.0, 1.0));
+    float width = usable_roughness(rough);
+    width *= width;
+    out_normal = vec4(normal, 2.0 / (width * width) - 2.0);
+#ifdef LIT
+    out_albedo = vec4(base.rgb * (1.0 - metal), 1.0);
+    out_specular = vec4(min(specular_of(base.rgb, metal), vec3(1.0)), 1.0);
+#else
     out_albedo = vec4(base.rgb, 1.0);
+    out_specular = vec4(0.0);
+#endif
 #endif
 }

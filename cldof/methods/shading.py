@@ -1,0 +1,61 @@
+"""Shading from points of the lens, for methods whose frames are glossy: kernels/shading.clh, shading.cl."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..host.passes import Buffer, Pass, Role, read, write
+from ..lighting import Environment
+from .base import FrameShape
+
+__all__ = ["PLANES", "environment_of", "shading_defines", "shading_inputs", "split_pass"]
+
+PLANES = 7
+"""Of the ``surface`` buffer: unit normal, specular reflectance, roughness. As kernels/shading.cl has it."""
+
+_LIGHTING_BYTES = 72 * 16
+_READ = ("normal", "specular", "shininess", "lighting")
+
+
+def shading_defines(shape: FrameShape) -> tuple[tuple[str, int], ...]:
+    """What kernels that include shading.clh are built with."""
+    return (("SHADING_ENVIRONMENT", int("environment" in shape.surface)),)
+
+
+def environment_of(shape: FrameShape) -> str:
+    """The buffer that goes in for ``environment``; of frames without one, a place-holder."""
+    return "environment" if "environment" in shape.surface else "lighting"
+
+
+def shading_inputs(shape: FrameShape) -> list[Buffer]:
+    """Buffers of a glossy frame that :func:`split_pass` and shading kernels read."""
+    slots = shape.layers * shape.height * shape.width
+    sizes = {"normal": slots * 12, "specular": slots * 12, "shininess": slots * 4, "lighting": _LIGHTING_BYTES}
+    if "environment" in shape.surface:
+        sizes["environment"] = Environment.TEXELS * 16
+    return [Buffer(name, nbytes, Role.INPUT) for name, nbytes in sizes.items()]
+
+
+def split_pass(shape: FrameShape) -> tuple[Pass, list[Buffer]]:
+    """Take what surfaces mirror out of ``color``: the pass, and the buffers ``matte`` and ``surface`` that it makes."""
+    slots = shape.layers * shape.height
+    buffers = [
+        Buffer("matte", slots * shape.width * 16),
+        Buffer("surface", slots * shape.pitch * 4 * PLANES),
+    ]
+    inputs = [read(name) for name in ("color", "inv_depth", *_READ, environment_of(shape))]
+    sizes = [np.int32(n) for n in (shape.layers, shape.height, shape.width, shape.pitch)]
+    extent = (shape.pitch // 16, shape.height, shape.layers)
+    traffic = sum(buffer.nbytes for buffer in buffers) + slots * shape.width * 48
+    one = Pass(
+        "shading",
+        "shading_split",
+        (write("matte"), write("surface"), *inputs, *sizes),
+        extent,
+        (1,) * len(extent),
+        shading_defines(shape),
+        traffic_bytes=math.ceil(traffic),
+    )
+    return one, buffers
