@@ -177,6 +177,20 @@ class LayeredFrame:
         return self.lighting is not None and bool((self.surface["specular"] > 0.0).any())
 
     @cached_property
+    def lobe_turn_per_m(self) -> float:
+        """How far highlights turn for a step of 1 m sideways, over their own width: the most of all glossy slots.
+
+        A lobe of GGX's width alpha stands half-way between light and eye, so it turns by half the angle that the eye
+        does. Times the aperture's radius it tells whether a lens sees any difference; 0 where nothing is glossy.
+        """
+        if not self.is_glossy:
+            return 0.0
+        with np.errstate(divide="ignore"):
+            inverse_width = np.sqrt((self.surface["shininess"] + 2.0) / 2.0)
+        turn = np.where((self.surface["specular"] > 0.0).any(axis=-1), inverse_width / self.depth, 0.0)
+        return float(turn.max()) / 2.0
+
+    @cached_property
     def inputs(self) -> dict[str, NDArray[np.float32]]:
         """What a method may read beside colour and depth, by name: surface buffers, and the packed lighting."""
         arrays = dict(self.surface)

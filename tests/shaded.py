@@ -34,10 +34,17 @@ def environment(seed: int = 0) -> Environment:
 
 
 def shaded_frame(
-    width: int, height: int, lighting: Lighting = LIGHTS, *, layers: int = 2, seed: int = 0, guard_px: int = 0
+    width: int,
+    height: int,
+    lighting: Lighting = LIGHTS,
+    *,
+    layers: int = 2,
+    seed: int = 0,
+    guard_px: int = 0,
+    opaque: bool = True,
 ) -> LayeredFrame:
     """The surfaces of ``noise_frame`` under random normals: half of them face the camera, some mirror nothing."""
-    frame = noise_frame(width, height, layers, seed=seed, guard_px=guard_px)
+    frame = noise_frame(width, height, layers, seed=seed, guard_px=guard_px, opaque=opaque)
     rng = np.random.default_rng([seed, 1])
     shape = frame.depth.shape
     normal = rng.normal((0.0, 0.0, 1.5), size=(*shape, 3))

@@ -81,3 +81,16 @@ def test_without_specular_nothing_is_glossy() -> None:
     assert not again.is_glossy
     bare = LayeredFrame(frame.color, frame.depth, frame.camera, **frame.surface)
     assert not bare.is_glossy and "lighting" not in bare.inputs
+
+
+def test_how_far_highlights_turn() -> None:
+    """One slot of roughness 0.2 at 2 m among matte ones: alpha is 0.04, the lobe turns by half of 1/2 rad a metre."""
+    shape = (1, 2, 3)
+    depth = np.full(shape, 0.5, np.float32)
+    specular, shininess = np.zeros((*shape, 3), np.float32), np.full(shape, 1e4, np.float32)
+    depth[0, 1, 2], specular[0, 1, 2], shininess[0, 1, 2] = 2.0, 0.04, 2.0 / 0.2**4 - 2.0
+    frame = LayeredFrame(
+        np.ones((*shape, 4), np.float32), depth, Camera(3, 2), normal=np.ones((*shape, 3), np.float32),
+        specular=specular, shininess=shininess, lighting=Lighting(),
+    )  # fmt: skip
+    assert frame.lobe_turn_per_m == pytest.approx(0.25 / 0.04, rel=1e-5)

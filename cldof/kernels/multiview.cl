@@ -42,6 +42,10 @@
 #ifndef MULTIVIEW_PEELED
 #define MULTIVIEW_PEELED 0
 #endif
+/* 1: rays come in groups, each through layers of its own (shading_view), and are summed up in `parts`. */
+#ifndef MULTIVIEW_PARTS
+#define MULTIVIEW_PARTS 0
+#endif
 
 typedef struct {
     int width, height, pitch, peels, layers, cells_x, cells_y;
@@ -376,6 +380,40 @@ static inline float4 pinhole(const __global float *color, MultiviewSize size, in
     return v;
 }
 
+/* A pixel from the sum of what rays have met; `clear` is that of rays that went past everything. */
+static inline float4 resolved(float4 sum, float clear, float least, const __global float *color, MultiviewSize size,
+                              int x, int y)
+{
+    const float known = sum.w + clear;
+    if (known <= least) return pinhole(color, size, x, y);
+    float4 v = sum / known;
+#if MULTIVIEW_VOID
+    v.w = v.w > 1.0f ? 1.0f : v.w;
+#else
+    v.w = 1.0f;
+#endif
+    return v;
+}
+
+/* multiview_finish: the image from the sums of all groups of rays.
+ * reads   parts  float[output height][output width][4], then clear float[output height][output width]
+ *         color  float[peels][height][width][4]
+ * writes  image  float[output height][output width][4]
+ * range   2-D, one item per row of the output: (1, output height), any local size */
+__kernel void multiview_finish(__global float *restrict image, const __global float *restrict parts,
+                               const __global float *restrict color, MultiviewSize size, int guard)
+{
+    const int y = get_global_id(1), width = size.width - 2 * guard, height = size.height - 2 * guard;
+    if (y >= height) return;
+    const __global float *clear = parts + (size_t)width * height * 4;
+    for (int x = 0; x < width; x++) {
+        const size_t at = (size_t)y * width + x;
+        const float4 v = resolved(load_pixel(parts + at * 4), MULTIVIEW_VOID ? clear[at] : 0.0f, MULTIVIEW_LEAST, color,
+                                  size, x + guard, y + guard);
+        store_pixel(image + at * 4, v);
+    }
+}
+
 /* multiview_trace: all rays of 16 pixels, front to back through the layers of their cells.
  * source  sections 4.3 and 4.4: v1 * c1 + (1 - v1) * c2
  * reads   layers    float[layers (+ 1)][height][pitch][4]
@@ -385,7 +423,8 @@ static inline float4 pinhole(const __global float *color, MultiviewSize size, in
  *         sets      int[cells_y][cells_x]
  *         ray_sets  int2[sets * STRIDE^2]  first ray and number of rays
  *         shifts    int2[rays][layers]  px, how far each ray has moved at each layer
- * writes  image     float[output height][output width][4]
+ * writes  image     float[output height][output width][4]; or, with MULTIVIEW_PARTS, adds to parts as multiview_finish
+ *                   has them, or begins them with the `first` group
  * range   2-D, one item per MULTIVIEW_SPAN pixels of an output row, any local size */
 __kernel void multiview_trace(__global float *restrict image, const __global float *restrict layers,
                               const __global uint *restrict lists, const __global int *restrict sets,
@@ -395,7 +434,11 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
                               const __global float *restrict inv_depth, const __global float *restrict extent,
                               const __global float *restrict bounds, float c1, float c0,
 #endif
-                              MultiviewSize size, int guard)
+                              MultiviewSize size, int guard
+#if MULTIVIEW_PARTS
+                              , int first
+#endif
+)
 {
     const int start = MULTIVIEW_SPAN * (int)get_global_id(0), y = (int)get_global_id(1) + guard;
     const int end_x = size.width - guard;
@@ -474,22 +517,23 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
             for (int j = 0; j < 4; j++) {
                 const int x = x0 + (4 * q + j) * MULTIVIEW_STRIDE;
                 if (x < guard || x >= end_x) continue;
-                float known = p[j].w;
 #if MULTIVIEW_VOID
-                known += clear[j];
-#endif
-                float4 v;
-                if (known > MULTIVIEW_LEAST * (float)rays.y) {
-                    v = p[j] / known;
-#if MULTIVIEW_VOID
-                    v.w = v.w > 1.0f ? 1.0f : v.w;
+                const float past_all = clear[j];
 #else
-                    v.w = 1.0f;
+                const float past_all = 0.0f;
 #endif
-                } else {
-                    v = pinhole(color, size, x, y);
-                }
-                store_pixel(out + (x - guard) * 4, v);
+#if MULTIVIEW_PARTS
+                __global float *sums = out + (x - guard) * 4;
+                store_pixel(sums, first ? p[j] : load_pixel(sums) + p[j]);
+#if MULTIVIEW_VOID
+                const int width = size.width - 2 * guard, height = size.height - 2 * guard;
+                __global float *gone = image + (size_t)width * height * 4 + (size_t)(y - guard) * width + (x - guard);
+                *gone = first ? past_all : *gone + past_all;
+#endif
+#else
+                const float least = MULTIVIEW_LEAST * (float)rays.y;
+                store_pixel(out + (x - guard) * 4, resolved(p[j], past_all, least, color, size, x, y));
+#endif
             }
         }
     }

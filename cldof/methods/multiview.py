@@ -12,6 +12,8 @@ Where this differs from the paper, docs/methods/multiview.md has the measurement
 - Layers overlap as far as the surface slopes from pixel to pixel, not by a fixed 10 %.
 - Cones see means over windows of exactly their width, not mip levels.
 - The number of rays follows the blur of what a cell of 16 x 16 pixels can see.
+- Glossy surfaces are shaded from points all over the lens before cones take their means, not at the hit after means of
+  normals and exponents were taken.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
 from ..lens import Aperture, Lens
 from .base import FrameShape, Plan, struct_scalar
+from .shading import shading_inputs, split_pass, view_pass
 
 __all__ = ["CELL", "MAX_LAYERS", "MAX_RAYS", "Cone", "LensLayers", "Multiview", "RaySets", "cones", "ray_sets"]
 
@@ -52,6 +55,9 @@ _FEWEST_LAYERS = 5
 _CONE_WIDTH = 1.1
 # Rays per px^2 of the largest circle of confusion that a cell can see: more are not traced. Costs up to 0.2 dB.
 _RAYS_PER_PX2 = 1.0
+# Highlights that turn by less than this share of their own width over the lens's radius count as those of the lens
+# centre. What is left out is of second order in it: below 1 % of a highlight.
+_LEAST_TURN = 0.1
 # Pixels of the jitter pattern along x and y.
 _JITTER = 4
 
@@ -62,12 +68,16 @@ _ENDLESS = 1e20
 
 
 class LensLayers(NamedTuple):
-    """Which layers there are, and through what aperture they are seen."""
+    """Which layers there are, through what aperture they are seen, and from how many of its points they are shaded.
+
+    ``eyes`` is 0 where all that the lens sees looks the same from all of it.
+    """
 
     front: int
     back: int
     delta_px: float
     aperture: Aperture
+    eyes: int = 0
 
     @property
     def total(self) -> int:
@@ -99,17 +109,20 @@ class RaySets(NamedTuple):
 
     Attributes
     ----------
-    ranges : ndarray of int32, (sets * patterns, 2)
-        First ray and number of rays.
+    ranges : ndarray of int32, (groups, sets * patterns, 2)
+        First ray and number of rays. There is one group for each eye, of the rays closest to it; one if there are none.
     shifts : ndarray of int32, (rays, K, 2)
         How many pixels right and down each ray has moved at each layer.
     needs : ndarray of int32, (K,)
         Which set the blur of a layer asks for.
+    eyes : ndarray, (groups, 2)
+        Middle of each group on the lens: right and up, in units of its radius.
     """
 
     ranges: NDArray[np.int32]
     shifts: NDArray[np.int32]
     needs: NDArray[np.int32]
+    eyes: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -137,6 +150,11 @@ class Multiview:
         Walk the layers that a cell can see, not all. Changes no pixel; False is for measurements.
     seed : int
         Of the lens samples.
+    view_dependent : bool
+        Shade what is glossy as points of the lens see it, in frames that know how (captured with surface buffers) and
+        where it shows. False: as the lens centre sees it.
+    eyes : int
+        From how many points at most; as many as rays for each ray's own.
     """
 
     rays: int = 64
@@ -148,12 +166,16 @@ class Multiview:
     adaptive: bool = True
     cull: bool = True
     seed: int = 0
+    view_dependent: bool = True
+    eyes: int = 16
 
     name = "multiview"
     simulated_aperture = None
 
     def __post_init__(self) -> None:
-        for name, low, high in (("rays", 1, MAX_RAYS), ("layers", _FEWEST_LAYERS, MAX_LAYERS), ("seed", 0, 2**31 - 1)):
+        limits = {"rays": (1, MAX_RAYS), "layers": (_FEWEST_LAYERS, MAX_LAYERS), "seed": (0, 2**31 - 1)}
+        limits["eyes"] = (1, MAX_RAYS)
+        for name, (low, high) in limits.items():
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise InputError(f"multiview: {name} is {value!r}; it must be a whole number from {low} to {high}.")
@@ -182,6 +204,8 @@ class Multiview:
         if self.traversal == "layers":
             most = min(most, max(_FEWEST_LAYERS, _LAYER_BYTES // (shape.height * shape.pitch * 16) - 2))
         layers = _layers(near_px, far_px, self.delta_px or _USUAL_DELTA_PX, most, lens.aperture)
+        if self.view_dependent and frame.lobe_turn_per_m * lens.aperture_radius_m > _LEAST_TURN:
+            layers = layers._replace(eyes=min(self.eyes, self.rays))
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},
@@ -190,8 +214,12 @@ class Multiview:
             "delta_px": layers.delta_px,
             "largest_near_coc_px": near_px,
             "largest_far_coc_px": far_px,
+            "eyes": layers.eyes,
         }
-        return Plan(layers, {"c1": np.float32(c1), "c0": np.float32(c0)}, summary)
+        params = {"c1": np.float32(c1), "c0": np.float32(c0)}
+        if layers.eyes:
+            params["aperture_radius_m"] = np.float32(lens.aperture_radius_m)
+        return Plan(layers, params, summary)
 
     def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
         """Declare the frame's passes."""
@@ -228,18 +256,25 @@ def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
     The first set has one ray, for cells in focus; powers of two below ``rays`` follow when adaptive; ``rays`` come
     last. With jitter there are 16 patterns of each.
     """
-    counts = [1]
+    groups = max(1, layers.eyes)  # every one has rays in every set
+    counts = [groups]
     if method.adaptive:
-        counts += [1 << n for n in range(2, 10) if 1 << n < method.rays]
+        counts += [1 << n for n in range(2, 10) if groups < 1 << n < method.rays]
     counts.append(method.rays)
     patterns = _JITTER**2 if method.jitter else 1
     ranges, shifts = [], []
     first = 0
     for count in counts:
         for pattern in range(patterns):
-            ranges.append((first, count))
-            shifts.append(_shifts(layers, count, method.seed * patterns + pattern))
+            points = layers.aperture.samples(count, method.seed * patterns + pattern)
+            order, sizes = _grouped(points, groups)
+            ends = first + np.cumsum(sizes)
+            ranges.append(np.stack([ends - sizes, sizes], axis=1))
+            shifts.append(_shifts(layers, points[order]))
             first += count
+    points = layers.aperture.samples(method.rays, method.seed * patterns)
+    order, sizes = _grouped(points, groups)
+    eyes = np.array([part.mean(axis=0) for part in np.split(points[order], np.cumsum(sizes)[:-1])])
     all_shifts = np.concatenate(shifts)
     needs = np.full(layers.total, len(counts) - 1)
     if method.adaptive:
@@ -247,13 +282,33 @@ def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
         needs = np.minimum(np.maximum(np.searchsorted(counts, wanted), 1), len(counts) - 1)
     if method.adaptive or layers.total == 1:
         needs[np.abs(all_shifts).max(axis=(0, 2)) == 0] = 0
-    return RaySets(np.array(ranges, np.int32), all_shifts, needs.astype(np.int32))
+    return RaySets(np.stack(ranges, axis=1).astype(np.int32), all_shifts, needs.astype(np.int32), eyes)
 
 
-def _shifts(layers: LensLayers, count: int, seed: int) -> NDArray[np.int32]:
+def _grouped(points: NDArray[np.float64], groups: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Points in an order that has ``groups`` of neighbours one after the other, and the size of each.
+
+    Halves of halves, across x and y in turn, so that the groups of any two sets of points lie in about the same places.
+    """
+    order, sizes = [], []
+
+    def split(part: NDArray[np.int64], count: int, axis: int) -> None:
+        if count == 1:
+            order.append(part)
+            sizes.append(len(part))
+            return
+        part = part[np.argsort(points[part, axis], kind="stable")]
+        middle = round(len(part) * (count // 2) / count)
+        split(part[:middle], count // 2, 1 - axis)
+        split(part[middle:], count - count // 2, 1 - axis)
+
+    split(np.arange(len(points)), groups, 0)
+    return np.concatenate(order), np.array(sizes)
+
+
+def _shifts(layers: LensLayers, points: NDArray[np.float64]) -> NDArray[np.int32]:
     # The ray through lens point v meets C at p + C * (-v.x, v.y), y down.
-    points = layers.aperture.samples(count, seed) * (-1.0, 1.0)
-    places = points[:, None] * layers.coc[None, :, None]
+    places = (points * (-1.0, 1.0))[:, None] * layers.coc[None, :, None]
     return np.asarray(np.floor(places + 0.5), dtype=np.int32)
 
 
@@ -273,7 +328,9 @@ class _Builder:
             ("MULTIVIEW_VOID", int(not shape.is_opaque)),
             ("MULTIVIEW_STRIDE", self.stride),
             ("MULTIVIEW_PEELED", int(self.peeled)),
+            ("MULTIVIEW_PARTS", int(layers.eyes > 0)),
         )
+        self.color = "view" if layers.eyes else "color"
         self.peel_bytes = shape.layers * shape.height * shape.pitch * 4
         self.layer_bytes = shape.height * shape.pitch * 16
         self.levels = max(self.cells).bit_length()
@@ -298,11 +355,26 @@ class _Builder:
             windows = cones(self.layers, self.method.rays)
         rays = ray_sets(self.method, self.layers)
         self._classify(windows, rays)
-        if not self.peeled:
-            self._split(windows)
-        if not self.shape.is_opaque:
-            self._past()
-        self._trace(rays)
+        if self.layers.eyes:
+            split, made = split_pass(self.shape, self.is_cpu)
+            self.passes.append(split)
+            peels = Buffer("view", self.shape.layers * self.shape.height * self.shape.width * 16)
+            self.buffers += [*shading_inputs(self.shape), *made, peels]
+        if any(windows):
+            self.buffers.append(Buffer("split", self.layer_bytes))
+        self._constant("shifts", rays.shifts)
+        if self.peeled:
+            self._constant("bounds", self.layers.bounds)
+        for group, ranges in enumerate(rays.ranges):
+            if self.layers.eyes:
+                self.passes.append(view_pass(self.shape, self.is_cpu, rays.eyes[group]))
+            if not self.peeled:
+                self._split(windows)
+            if not self.shape.is_opaque:
+                self._past()
+            self._trace(group, ranges)
+        if self.layers.eyes:
+            self._finish()
         return FrameProgram.of(self.buffers, self.passes)
 
     def _classify(self, windows: list[Cone | None], rays: RaySets) -> None:
@@ -345,8 +417,6 @@ class _Builder:
 
     def _split(self, windows: list[Cone | None]) -> None:
         """Fill the layers, as cones see them."""
-        if any(windows):
-            self.buffers.append(Buffer("split", self.layer_bytes))
         bounds = self.layers.bounds
         for layer, window in enumerate(windows):
             stack = write("layers") if layer == 0 else read_write("layers")
@@ -355,7 +425,7 @@ class _Builder:
                 "multiview_split",
                 (
                     stack if window is None else write("split"),
-                    read("color"),
+                    read(self.color),
                     read("inv_depth"),
                     read("extent"),
                     read("nbuffer"),
@@ -396,31 +466,44 @@ class _Builder:
             self.layer_bytes,
         )
 
-    def _trace(self, rays: RaySets) -> None:
-        self._constant("ray_sets", rays.ranges)
-        self._constant("shifts", rays.shifts)
+    def _trace(self, group: int, ranges: NDArray[np.int32]) -> None:
+        ray_sets = f"ray_sets{group}"
+        self._constant(ray_sets, ranges)
         height, width = self.shape.output_size
         peels: tuple[Any, ...] = ()
         if self.peeled:
-            self._constant("bounds", self.layers.bounds)
             peels = (*(read(name) for name in ("inv_depth", "extent", "bounds")), *self.lens)
+        out = write("image")
+        if self.layers.eyes:
+            out = write("parts") if group == 0 else read_write("parts")
         self._add(
             "multiview_trace",
             (
-                write("image"),
+                out,
                 # Where there are no layers this is only a place-holder.
-                read("layers" if not self.peeled or not self.shape.is_opaque else "color"),
+                read("layers" if not self.peeled or not self.shape.is_opaque else self.color),
                 read("lists"),
                 read("sets"),
-                read("ray_sets"),
+                read(ray_sets),
                 read("shifts"),
-                read("color"),
+                read(self.color),
                 *peels,
                 self.size,
                 np.int32(self.shape.guard_px),
+                *((np.int32(group == 0),) if self.layers.eyes else ()),
             ),
             (-(-self.shape.width // (16 * self.stride)), height),
-            height * width * 16 * (self.method.rays + 1),
+            height * width * 16 * (int(ranges[-1, 1]) + 1),
+        )
+
+    def _finish(self) -> None:
+        height, width = self.shape.output_size
+        self.buffers.append(Buffer("parts", height * width * 4 * (4 if self.shape.is_opaque else 5)))
+        self._add(
+            "multiview_finish",
+            (write("image"), read("parts"), read("color"), self.size, np.int32(self.shape.guard_px)),
+            (1, height),
+            height * width * 32,
         )
 
     def _constant(self, name: str, data: NDArray[Any]) -> None:

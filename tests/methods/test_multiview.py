@@ -30,7 +30,7 @@ def render(device: Device, frame: LayeredFrame, lens: Lens, one_ray: np.ndarray 
         buffers = dict(program.buffers)
         for name, data in (
             ("shifts", np.repeat(one_ray[None], 1, 0)),
-            ("ray_sets", np.repeat([[0, 1]], 16, 0)),
+            ("ray_sets0", np.repeat([[0, 1]], 16, 0)),
         ):
             data = np.ascontiguousarray(data, np.int32)
             buffers[name] = replace(buffers[name], nbytes=data.nbytes, data=data)
@@ -43,7 +43,7 @@ def twin(device: Device, frame: LayeredFrame, lens: Lens, **options) -> np.ndarr
     method = Multiview(adaptive=False, **options)
     layers = method.plan(frame, lens).structure
     rays = ray_sets(method, layers)
-    first, count = rays.ranges[-1]
+    first, count = rays.ranges[0, -1]
     windows = cones(layers, method.rays) if method.has_cones else [None] * layers.total
     inverse = inverse_depth(device, frame)[..., : frame.width].astype(np.float64)
     return oracle.render(
