@@ -9,21 +9,22 @@ much that can change a pixel at most.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Hashable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Camera
 from .frame import LayeredFrame
-from .host.passes import Buffer, Param, Pass, Role, read, write
+from .host.device import Traits
+from .host.passes import Access, Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
 from .lens import Lens
-from .methods.base import FrameShape, Plan, struct_scalar
+from .methods.base import FrameShape, Method, Plan, struct_scalar
 
-__all__ = ["BINS", "MAX_CHANGE", "TILE", "Decision", "FramePlan", "SceneStats"]
+__all__ = ["BINS", "MAX_CHANGE", "TILE", "Decision", "FramePlan", "SceneStats", "everything", "plan_frame"]
 
 # Constants of kernels/stats.cl.
 TILE = 16
@@ -35,7 +36,23 @@ MAX_CHANGE = 1.0 / 255.0
 # A bin is this much wider than it is: float32 and float64 may disagree about the bin of a slot.
 _BIN_SLACK = 1e-3
 
+# Sides whose CoC radius stays below this have no layers in any method.
+_NEGLIGIBLE_PX = 1e-3
+# In how many ways light from beyond a window may change a pixel: as the light of what is in front and behind, by how
+# much that covers, and as light that reaches what is in focus.
+_TAIL_USES = 6.0
+# Windows that are more of the frame than this are not worth it: cutting out and pasting is work, too.
+_LARGEST_SHARE = 0.75
+_MOST_WINDOWS = 4
+# Windows begin and end at multiples of this, in px.
+_GRID = 64
+# Reaches are rounded up to these, in tiles.
+_RINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 10**6)
+# Inverse depth of what is past a row, as kernels/common.clh has it.
+EMPTY = -1.0
+
 _FLOAT = np.dtype(np.float32)
+_WINDOW = np.dtype([(name, np.int32) for name in ("x", "y", "x0", "y0", "x1", "y1")])
 _SIZE = np.dtype([(name, np.int32) for name in ("width", "height", "pitch", "peels", "tiles_x", "tiles_y")])
 _TILE_STATS = np.dtype(
     [
@@ -225,6 +242,482 @@ class FramePlan(Plan):
     def explain(self) -> str:
         """The plan in words, for people."""
         return "\n".join(f"{'kept' if one.kept else 'left out'}: {one.effect}: {one.reason}" for one in self.decisions)
+
+
+class Window(NamedTuple):
+    """A part of the frame, guard band included, that the method is run on; all in px."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    inner: tuple[int, int, int, int]
+    """x0, y0, x1, y1 of what its result is used for."""
+
+
+class Layout(NamedTuple):
+    """What shapes the passes of a planned frame."""
+
+    inner: Hashable  # the method's own
+    peels: int
+    windows: tuple[tuple[int, int], ...] | None  # widths and heights; None: the whole frame, with no window
+
+
+def everything(method: Method, frame: LayeredFrame, lens: Lens) -> FramePlan:
+    """The plan that leaves nothing out."""
+    widen = getattr(method, "plan_both_sides", method.plan)
+    base = widen(frame, lens)
+    decisions = (Decision("everything", True, "planning is off"),)
+    return FramePlan(Layout(base.structure, frame.layer_count, None), base.params, dict(base.summary), decisions)
+
+
+def plan_frame(
+    method: Method, frame: LayeredFrame, lens: Lens, stats: SceneStats, traits: Traits, max_change: float = MAX_CHANGE
+) -> FramePlan:
+    """Decide what to compute.
+
+    Parameters
+    ----------
+    method : Method
+    frame : LayeredFrame
+        For its camera and its range of depths.
+    lens : Lens
+    stats : SceneStats
+        Of this frame; of another one, no bound holds.
+    traits : Traits
+        Of the device.
+    max_change : float
+        What may change a pixel at most, linear units. 0 leaves out only what changes nothing.
+
+    Returns
+    -------
+    FramePlan
+    """
+    base = method.plan(frame, lens)
+    return _Planner(method, base, frame, lens, stats, traits, max_change).plan()
+
+
+class _Planner:
+    """One frame through one lens."""
+
+    def __init__(
+        self,
+        method: Method,
+        base: Plan,
+        frame: LayeredFrame,
+        lens: Lens,
+        stats: SceneStats,
+        traits: Traits,
+        max_change: float,
+    ) -> None:
+        self.method, self.base, self.stats, self.max_change = method, base, stats, max_change
+        self.shape = stats.shape
+        self.c1, self.c0 = lens.coc_coefficients(frame.camera)
+        # Half of what is allowed is for what lies beyond windows, half for what is taken to be in focus.
+        self.contrast = max(stats.brightest, 1e-6)
+        tail = max_change / 2.0 / (_TAIL_USES * self.contrast)
+        self.locality = method.locality(self.shape, base, traits, tail)
+        # Nothing in a plan says that shading does not depend on the place, unless it says that there is none.
+        if self.shape.is_glossy and method.simulated_aperture is None and base.summary.get("eyes", 1):
+            self.locality = None
+        # The device computes CoC from float32 numbers.
+        largest = max(abs(w) for w in frame.inverse_depth_range)
+        self.slack_px = 4e-7 * (abs(self.c1) * largest + abs(self.c0))
+
+    def plan(self) -> FramePlan:
+        decisions = list(self._sides())
+        windows, focus = self._in_focus()
+        decisions.append(focus)
+        peels, which = self._peels(windows)
+        decisions += which
+        decisions += self._of_the_method(windows)
+        bound = sum(one.error for one in decisions)
+        params: dict[str, Any] = dict(self.base.params)
+        sizes = None
+        if windows is not None:
+            sizes = tuple((window.width, window.height) for window in windows)
+            if not windows:
+                params = {}
+            for number, window in enumerate(windows):
+                params[f"window_{number}"] = struct_scalar(_WINDOW, window.x, window.y, *window.inner)
+        summary = {**self.base.summary, "error_bound": bound, "peels_used": peels, "windows": sizes}
+        inner = self.base.structure if windows is None or windows else None
+        return FramePlan(Layout(inner, peels, sizes), params, summary, tuple(decisions), bound)
+
+    # --- sides ---
+
+    def _coc(self, inverse: Array) -> NDArray[np.float64]:
+        return np.asarray(self.c1 * inverse.astype(np.float64) + self.c0)
+
+    @cached_property
+    def near_px(self) -> NDArray[np.float64]:
+        """By how much the nearest slot of each tile is out of focus in front, (ty, tx); 0 for none."""
+        nearest = self.stats.nearest.max(axis=0)
+        return np.where(nearest >= 0.0, np.maximum(-self._coc(nearest), 0.0), 0.0)
+
+    @cached_property
+    def seen(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and greatest signed CoC of what a tile shows, (ty, tx), whatever its peel; inf, -inf for nothing."""
+        stats = self.stats
+        closed = stats.is_closed[0]
+        nearest = np.where(closed, stats.nearest[0], stats.nearest.max(axis=0))
+        farthest = np.where(closed, stats.farthest[0], stats.farthest.min(axis=0))
+        if not self.shape.is_opaque:  # the void is a surface at infinity
+            is_open = ~stats.is_closed.any(axis=0)
+            farthest = np.where(is_open, 0.0, farthest)
+            nearest = np.where(is_open, np.maximum(nearest, 0.0), nearest)
+        something = farthest <= nearest
+        # A lens with c1 = 0 blurs nothing; 0 * inf is not a number.
+        low = np.where(something, self._coc(np.where(something, nearest, 0.0)), np.inf)
+        high = np.where(something, self._coc(np.where(something, farthest, 0.0)), -np.inf)
+        return low, high
+
+    def _sides(self) -> Iterator[Decision]:
+        stats = self.stats
+        coc = self.c1 * (stats.bin_edges[1:] + stats.bin_edges[:-1]) / 2.0 + self.c0
+        visible = max(float(stats.histogram[0].sum()), 1.0)
+        low, high = self.seen
+        ends = (("near side", low, coc < 0.0, "in front of"), ("far side", high, coc > 0.0, "behind"))
+        for name, extreme, side, where in ends:
+            extreme = extreme[np.isfinite(extreme)]
+            reach = max(0.0, float((-extreme if name == "near side" else extreme).max(initial=0.0)))
+            share = float(stats.histogram[0][side & (np.abs(coc) > 0.5)].sum()) / visible
+            kept = reach > _NEGLIGIBLE_PX
+            if kept:
+                reason = (
+                    f"up to {reach:.1f} px of blur {where} the focus; {share:.0%} of the picture has over half a pixel"
+                )
+            else:
+                reason = f"nothing {where} the focus is blurred by more than {reach:.2g} px"
+            yield Decision(name, kept, reason, saving=0.0 if kept else 0.5)
+
+    # --- tiles ---
+
+    def _in_focus(self) -> tuple[tuple[Window, ...] | None, Decision]:
+        """The parts of the frame that have to be computed, None for all of it."""
+        name = "tiles in focus"
+        if self.locality is None:
+            return None, Decision(name, True, "with these options the method's pixels depend on their place")
+        bound = self._bounds()
+        allowed = self.max_change / 2.0
+        active = bound > allowed
+        share = float((active * self.stats.pixels).sum() / self.stats.pixels.sum())
+        error = float(bound[~active].max(initial=0.0))
+        if not active.any():
+            reason = f"all {active.size} tiles of {TILE} x {TILE} px show what a pinhole sees"
+            return (), Decision(name, False, reason, error, 1.0)
+        full = self.shape.width * self.shape.height
+        windows = self._windows(active)
+        area = sum(window.width * window.height for window in windows)
+        if area > _LARGEST_SHARE * full:
+            reason = (
+                f"{share:.0%} of the tiles are blurred or within reach of a blur; with what they depend on, too many"
+            )
+            return None, Decision(name, True, reason)
+        if not self._may_cut(windows):
+            reason = "what is hidden has to be guessed from all around, so the frame is not taken apart"
+            return None, Decision(name, True, reason)
+        if self.locality.tail > 0.0:
+            error += _TAIL_USES * self.locality.tail * self.contrast
+        parts = f"{len(windows)} window{'s' if len(windows) > 1 else ''} of {area / full:.0%} of the frame"
+        reason = f"{1.0 - share:.0%} of the tiles show what a pinhole sees; the rest is done in {parts}"
+        slots = self.shape.layers * 20
+        return windows, Decision(name, False, reason, error, 1.0 - area / full, int((full - area) * slots))
+
+    def _bounds(self) -> NDArray[np.float64]:
+        """What showing the pinhole's pixels can change, tile by tile, (ty, tx)."""
+        locality, stats = self.locality, self.stats
+        assert locality is not None
+        low, high = self.seen
+        own = np.maximum(np.where(np.isfinite(low), np.abs(low), 0.0), np.where(np.isfinite(high), np.abs(high), 0.0))
+        own = np.where(own > 0.0, own + self.slack_px, 0.0)
+        slope = abs(self.c1) * stats.step.max(axis=0) if locality.counts_slopes else 0.0
+        leak = locality.leak(own + np.where(own > 0.0, slope, 0.0))
+        if not locality.spreads:
+            return np.asarray(leak * self.contrast, np.float64)
+        near = np.where(self.near_px > 0.0, self.near_px + self.slack_px, 0.0)
+        rings = np.where(near > 0.0, np.ceil(locality.reach_px(near) / TILE), 0.0)
+        near_leak = np.where(near > 0.0, locality.leak(near + np.where(near > 0.0, slope, 0.0)), 0.0)
+        inner = 0
+        for ring in _RINGS:
+            those = (rings > inner) & (rings <= ring)
+            inner = ring
+            if those.any():
+                leak = np.maximum(leak, _spread(np.where(those, near_leak, 0.0), ring))
+        farthest_reach = float(locality.reach_px(np.array([max(float(own.max()), float(near.max()))]))[0])
+        contrast = self._contrast(math.ceil(farthest_reach / TILE) + 1)
+        return np.asarray(np.minimum(2.0 * leak, 1.0) * contrast)
+
+    def _contrast(self, radius: int) -> NDArray[np.float64]:
+        """How much two colours within so many tiles differ, (ty, tx)."""
+        stats = self.stats
+        # Glass adds its light to that of what is behind it.
+        high = stats.high.sum(axis=0) if self.shape.has_glass else stats.high.max(axis=0)
+        low = stats.low.min(axis=0)
+        is_gap = ~stats.is_closed[0] & (self.shape.has_glass | ~stats.is_closed.any(axis=0))
+        low = np.where(is_gap[..., None], 0.0, low)
+        difference = np.zeros(stats.tiles)
+        for channel in range(4):
+            most, least = _spread(high[..., channel], radius), -_spread(-low[..., channel], radius)
+            difference = np.maximum(difference, most - least)
+        return difference
+
+    def _may_cut(self, windows: tuple[Window, ...]) -> bool:
+        """Whether nothing has to be guessed near the windows."""
+        limit = self.locality.guesses_nearer_than_px if self.locality is not None else -math.inf
+        if limit == -math.inf:
+            return True
+        # A closed peel that is far enough is not culled, and then there is nothing to guess.
+        farther = np.where(self.stats.is_closed, self._coc(np.maximum(self.stats.nearest, 0.0)), -np.inf)
+        known = farther.max(axis=0) >= limit + self.slack_px
+        return all(bool(known[_tiles_of(window)].all()) for window in windows)
+
+    def _windows(self, active: NDArray[np.bool_]) -> tuple[Window, ...]:
+        assert self.locality is not None
+        boxes = _boxes(active, _MOST_WINDOWS, self._gap_tiles)
+        return tuple(self._window(box) for box in boxes)
+
+    @property
+    def _gap_tiles(self) -> int:
+        """Empty tiles from which on two windows are less work than one."""
+        assert self.locality is not None
+        return math.ceil((2 * self.locality.margin_px + self.locality.align_px) / TILE) + 1
+
+    def _window(self, box: tuple[int, int, int, int]) -> Window:
+        assert self.locality is not None
+        width, height, margin = self.shape.width, self.shape.height, self.locality.margin_px
+        # A coarse grid, so that a focus in motion keeps to few sizes.
+        grid = max(self.locality.align_px, _GRID)
+        x0, y0, x1, y1 = (n * TILE for n in box)
+        x1, y1 = min(x1, width), min(y1, height)
+        left, top = max(x0 - margin, 0) // grid * grid, max(y0 - margin, 0) // grid * grid
+        right, bottom = (min(-(-(n + margin) // grid) * grid, side) for n, side in ((x1, width), (y1, height)))
+        return Window(left, top, right - left, bottom - top, (x0, y0, x1, y1))
+
+    # --- peels ---
+
+    def _peels(self, windows: tuple[Window, ...] | None) -> tuple[int, list[Decision]]:
+        stats, layers = self.stats, self.shape.layers
+        if windows == ():
+            return layers, []
+        where = [(slice(None), slice(None))] if windows is None else [_tiles_of(window) for window in windows]
+        revealed = self._revealed()
+        peels = 1
+        for peel in range(1, layers):
+            if any(bool(revealed[(peel, *tiles)].any()) for tiles in where):
+                peels = peel + 1
+        decisions = []
+        pixels = self.shape.width * self.shape.height
+        for peel in range(1, layers):
+            share = float(stats.slots[peel].sum()) / pixels
+            kept = peel < peels
+            if kept:
+                bare = float((revealed[peel] * stats.pixels).sum()) / pixels
+                reason = f"covers {share:.1%} of the frame; a blur may reach it in {bare:.0%} of the tiles"
+            elif share == 0.0:
+                reason = "nothing is in it"
+            else:
+                reason = f"covers {share:.1%} of the frame, always behind what lets nothing through"
+            saved = 0 if kept else pixels * 20
+            decisions.append(Decision(f"peel {peel + 1}", kept, reason, 0.0, 0.0 if kept else 0.5 / layers, saved))
+        return peels, decisions
+
+    def _revealed(self) -> NDArray[np.bool_]:
+        """Tiles in which a peel may show, (M, ty, tx)."""
+        stats, locality = self.stats, self.locality
+        there = stats.slots > 0.0
+        if not self.shape.is_opaque:
+            there[1:] |= there[:-1]  # where a peel has nothing the void begins, and hides what is behind
+        if locality is None or (not self.shape.is_opaque and locality.spreads):
+            return there
+        if locality.spreads:
+            # Where several layers lie behind one another light may come from as far as both are spread.
+            low, high = self.seen
+            ends = np.array([np.abs(v[np.isfinite(v)]).max(initial=0.0) for v in (low, high)])
+            deepest = self._coc(np.where(stats.slots > 0, stats.farthest, 1.0 / 1e30))
+            ends = np.append(ends, np.abs(deepest[stats.slots > 0]).max(initial=0.0))
+            radius = math.ceil(2.0 * float(locality.reach_px(ends).max()) / TILE) + 1
+        else:
+            radius = 0
+        hidden = np.zeros(stats.tiles, bool)
+        revealed = there.copy()
+        for peel in range(1, self.shape.layers):
+            smooth = stats.is_closed[peel - 1] & (abs(self.c1) * stats.step[peel - 1] <= locality.closed_step_px)
+            if radius:
+                smooth = _spread((~smooth).astype(np.float64), radius) == 0.0
+            hidden |= smooth
+            revealed[peel] &= ~hidden
+        return revealed
+
+    # --- what only the method knows ---
+
+    def _of_the_method(self, windows: tuple[Window, ...] | None) -> list[Decision]:
+        explain = getattr(self.method, "explain", None)
+        if explain is None or windows == ():
+            return []
+        return [Decision(*entry) for entry in explain(self.base)]
+
+
+def planned_program(method: Method, shape: FrameShape, plan: FramePlan, traits: Traits) -> FrameProgram:
+    """The passes of a planned frame; depends on ``plan.structure`` only."""
+    layout = plan.structure
+    assert isinstance(layout, Layout)
+    used = shape._replace(layers=layout.peels)
+    if layout.windows is None:
+        return method.program(used, Plan(layout.inner, plan.params, {}), traits)
+    out_height, out_width = shape.output_size
+    one = (1,) if traits.is_cpu else None
+    two = (1, 1) if traits.is_cpu else None
+    extent = (np.int32(shape.width), np.int32(shape.height))
+    guard = np.int32(shape.guard_px)
+    # The pinhole image takes all peels: what glass lets through shows without any blur.
+    inputs = {"color": Buffer("color", shape.layers * shape.height * shape.width * 16, Role.INPUT)}
+    buffers = [Buffer("image", out_height * out_width * 16, Role.OUTPUT)]
+    passes = [
+        Pass(
+            "plan",
+            "plan_pinhole",
+            (write("image"), read("color"), *extent, np.int32(shape.layers), guard),
+            (out_height,),
+            one,
+            traffic_bytes=out_height * out_width * 32,
+        )
+    ]
+    for number, (width, height) in enumerate(layout.windows):
+        window = Param(f"window_{number}", _WINDOW)
+        part = used._replace(width=width, height=height, guard_px=0)
+        program = method.program(part, Plan(layout.inner, plan.params, {}), traits)
+        names = {name: f"{number}_{name}" for name in program.buffers}
+        for buffer in program.buffers.values():
+            role = Role.TRANSIENT if buffer.role in (Role.INPUT, Role.OUTPUT) else buffer.role
+            buffers.append(replace(buffer, name=names[buffer.name], role=role))
+            if buffer.role is not Role.INPUT:
+                continue
+            pitches, channels, fill = _input_layout(buffer.name, shape.width, shape.pitch, part.width, part.pitch)
+            size = shape.layers * shape.height * pitches[0] * channels * 4
+            inputs[buffer.name] = Buffer(buffer.name, size, Role.INPUT)
+            passes.append(
+                Pass(
+                    "plan",
+                    "plan_window",
+                    (
+                        write(names[buffer.name]),
+                        read(buffer.name),
+                        np.int32(pitches[0]),
+                        np.int32(shape.height),
+                        np.int32(width),
+                        np.int32(pitches[1]),
+                        np.int32(height),
+                        np.int32(channels),
+                        np.float32(fill),
+                        window,
+                    ),
+                    (height, used.layers),
+                    two,
+                    traffic_bytes=2 * buffer.nbytes,
+                )
+            )
+        for step in program.passes:
+            args = tuple(
+                replace(arg, buffer=names[arg.buffer]) if isinstance(arg, Access) else arg for arg in step.args
+            )
+            passes.append(replace(step, args=args))
+        passes.append(
+            Pass(
+                "plan",
+                "plan_paste",
+                (
+                    read_write("image"),
+                    read(names["image"]),
+                    *extent,
+                    guard,
+                    np.int32(width),
+                    np.int32(height),
+                    window,
+                ),
+                (height,),
+                one,
+                traffic_bytes=width * height * 32,
+            )
+        )
+    return FrameProgram.of([*inputs.values(), *buffers], passes)
+
+
+def _input_layout(
+    name: str, width: int, pitch: int, part_width: int, part_pitch: int
+) -> tuple[tuple[int, int], int, float]:
+    """Pitches of an input of the frame and of a window in px, its channels, and what stands past the rows."""
+    if name == "inv_depth":
+        return (pitch, part_pitch), 1, EMPTY
+    return (width, part_width), {"color": 4, "normal": 3, "albedo": 3}.get(name, 1), 0.0
+
+
+def _tiles_of(window: Window) -> tuple[slice, slice]:
+    """Rows and columns of tiles that a window touches."""
+    return (
+        slice(window.y // TILE, -(-(window.y + window.height) // TILE)),
+        slice(window.x // TILE, -(-(window.x + window.width) // TILE)),
+    )
+
+
+def _spread(values: NDArray[Any], radius: int) -> NDArray[np.float64]:
+    """Maximum over a square of so many tiles on each side."""
+    result = np.asarray(values, np.float64)
+    for axis in (0, 1):
+        count = result.shape[axis]
+        reach = min(radius, count - 1)
+        if reach <= 0:
+            continue
+        pad = [(0, 0), (0, 0)]
+        pad[axis] = (reach, reach)
+        lines = np.moveaxis(np.pad(result, pad, constant_values=-np.inf), axis, 0)
+        window, size = lines, 1
+        while 2 * size <= 2 * reach + 1:
+            window = np.maximum(window[:-size], window[size:])
+            size *= 2
+        rest = 2 * reach + 1 - size
+        result = np.moveaxis(np.maximum(window[:count], window[rest : rest + count]), 0, axis)
+    return result
+
+
+def _boxes(active: NDArray[np.bool_], most: int, gap: int) -> list[tuple[int, int, int, int]]:
+    """Boxes (x0, y0, x1, y1) around what is set, cut along empty rows and columns at least ``gap`` wide."""
+    boxes = [_around(active, (0, 0, active.shape[1], active.shape[0]))]
+    while len(boxes) < most:
+        cuts = [(*_widest_gap(active, box), box) for box in boxes]
+        width, axis, start, box = max(cuts, key=lambda cut: cut[0])
+        if width < gap:
+            break
+        x0, y0, x1, y1 = box
+        halves = (
+            ((x0, y0, start, y1), (start + width, y0, x1, y1))
+            if axis
+            else ((x0, y0, x1, start), (x0, start + width, x1, y1))
+        )
+        boxes.remove(box)
+        boxes += [_around(active, half) for half in halves]
+    return sorted(boxes)
+
+
+def _around(active: NDArray[np.bool_], box: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+    x0, y0, x1, y1 = box
+    part = active[y0:y1, x0:x1]
+    columns, rows = np.flatnonzero(part.any(axis=0)), np.flatnonzero(part.any(axis=1))
+    return x0 + int(columns[0]), y0 + int(rows[0]), x0 + int(columns[-1]) + 1, y0 + int(rows[-1]) + 1
+
+
+def _widest_gap(active: NDArray[np.bool_], box: tuple[int, int, int, int]) -> tuple[int, int, int]:
+    """Width, axis (1: columns) and place of the widest run of empty rows or columns in a box."""
+    x0, y0, x1, y1 = box
+    part = active[y0:y1, x0:x1]
+    found = (0, 0, 0)
+    for axis, first in ((0, y0), (1, x0)):
+        lines = np.flatnonzero(part.any(axis=1 - axis))
+        if len(lines) > 1:
+            gaps = np.diff(lines) - 1
+            at = int(gaps.argmax())
+            found = max(found, (int(gaps[at]), axis, first + int(lines[at]) + 1))
+    return found
 
 
 def bin_scale(frame: LayeredFrame) -> tuple[float, float]:

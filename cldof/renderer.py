@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Any
 
@@ -20,14 +21,27 @@ from .host.passes import Buffer, FrameProgram, Pass, Role, read, write
 from .host.profile import PassTiming, pass_timings
 from .host.scheduler import Batch, FrameRing, Submission, compile
 from .lens import Lens
-from .methods import FrameShape, Plan, make_method
-from .planner import SceneStats, bin_scale, buffer_sizes, read_stats, stats_passes
+from .methods import FrameShape, make_method
+from .planner import (
+    MAX_CHANGE,
+    FramePlan,
+    SceneStats,
+    bin_scale,
+    buffer_sizes,
+    everything,
+    plan_frame,
+    planned_program,
+    read_stats,
+    stats_passes,
+)
 
 __all__ = ["PendingResult", "Renderer", "Result", "frame_stats"]
 
 # Pass lists kept for the most recent kinds of frame (shape and plan structure); the pool passes their memory on.
 _KEPT_PROGRAMS = 4
 _MAX_SUPERSAMPLE = 8
+# Plans kept with a frame.
+_KEPT_PLANS = 16
 # Pixels an item of frame_box makes, as kernels/frame.cl has it.
 _BOX_RUN = 16
 # Inverse depth of a slot with nothing in it, as kernels/common.clh has it.
@@ -46,14 +60,15 @@ class Result:
         Per pass, in order; empty unless the renderer was made with ``profile=True``.
     wall_ms : float
         From the call to the image on the host.
-    plan : Plan
-        What was computed; ``plan.summary`` has it in plain numbers.
+    plan : FramePlan
+        What was computed and what was left out; ``print(plan.explain())`` says it in words, ``plan.summary`` in plain
+        numbers.
     """
 
     image: NDArray[np.float32]
     timings: list[PassTiming]
     wall_ms: float
-    plan: Plan
+    plan: FramePlan
 
 
 @dataclass
@@ -65,7 +80,8 @@ class _DeviceFrame:
     arrays: dict[str, HostInput]  # color, and what else of the frame a method asked for
     preparation: Batch  # made inv_depth, and owns it
     ready: Any  # event
-    stats: _ComingStats
+    stats: _ComingStats | None  # None: planning is off
+    plans: dict[Any, FramePlan] = field(default_factory=dict)  # by method and lens
     last_use: Any = None  # event
 
 
@@ -99,7 +115,13 @@ class PendingResult:
     """A frame on its way; made by :meth:`Renderer.render_async`."""
 
     def __init__(
-        self, submission: Submission, event: Any, image: NDArray[np.float32], plan: Plan, started: float, profile: bool
+        self,
+        submission: Submission,
+        event: Any,
+        image: NDArray[np.float32],
+        plan: FramePlan,
+        started: float,
+        profile: bool,
     ) -> None:
         self._submission, self._event, self._image, self._plan = submission, event, image, plan
         self._started, self._profile = started, profile
@@ -150,6 +172,11 @@ class Renderer:
     supersample : int
         Frames come in captured this many times larger than the image, and the image is box-filtered down after the
         blur: edges in focus become smooth, at about the square of the cost.
+    planned : bool
+        Leave out what the frame in front of the lens does not call for (:mod:`cldof.planner`). False computes
+        everything, for comparison.
+    max_change : float
+        What leaving out may change a pixel by at most, in linear units; 0 leaves out only what changes nothing.
     **options
         The method's, for instance ``layers=12`` (:class:`cldof.methods.layered.Layered`).
 
@@ -172,8 +199,12 @@ class Renderer:
         out_of_order: bool = False,
         frames_in_flight: int = 2,
         supersample: int = 1,
+        planned: bool = True,
+        max_change: float = MAX_CHANGE,
         **options: Any,
     ) -> None:
+        if not (isinstance(max_change, int | float) and 0.0 <= max_change < math.inf):
+            raise InputError(f"max_change is {max_change!r}; it must be a number of at least 0, in linear units.")
         self.method = make_method(method, **options)
         if frames_in_flight < 1:
             raise InputError(f"frames_in_flight is {frames_in_flight}; it must be at least 1.")
@@ -187,6 +218,7 @@ class Renderer:
             self.device = Device.open(device, profiling=profile, out_of_order=out_of_order)
         self._slots = frames_in_flight
         self._supersample = supersample
+        self._planned, self._max_change = planned, float(max_change)
         self._lock = threading.Lock()
         self._rings: OrderedDict[Any, FrameRing] = OrderedDict()
         # Recent frames by identity; holding the frame keeps the identity from being used again.
@@ -233,8 +265,8 @@ class Renderer:
         with self._lock:
             if self._closed:
                 raise DeviceError("This renderer is closed; make a new one.")
-            plan = self.method.plan(frame, lens)
             held = self._upload(frame, shape)
+            plan = self._plan(held, lens)
             ring = self._ring(shape, plan)
             inputs, waits = self._inputs(held, ring.program)
             submission = ring.submit(inputs, plan.params, waits)
@@ -255,7 +287,10 @@ class Renderer:
         with self._lock:
             if self._closed:
                 raise DeviceError("This renderer is closed; make a new one.")
-            return self._upload(frame, FrameShape.of(frame)).stats.wait()
+            held = self._upload(frame, FrameShape.of(frame))
+            if held.stats is None:
+                raise InputError("This renderer was made with planned=False and gathers no statistics.")
+            return held.stats.wait()
 
     @property
     def peak_device_bytes(self) -> int:
@@ -289,6 +324,22 @@ class Renderer:
             if error is None:
                 raise
 
+    def _plan(self, held: _DeviceFrame, lens: Lens) -> FramePlan:
+        """What to compute; kept with the frame for the lenses last seen."""
+        key = (self.method, lens)
+        plan = held.plans.get(key)
+        if plan is None:
+            if held.stats is None:
+                plan = everything(self.method, held.frame, lens)
+            else:
+                plan = plan_frame(
+                    self.method, held.frame, lens, held.stats.wait(), self.device.traits, self._max_change
+                )
+            while len(held.plans) >= _KEPT_PLANS:
+                held.plans.pop(next(iter(held.plans)))
+            held.plans[key] = plan
+        return plan
+
     def _image_size(self, shape: FrameShape) -> tuple[int, int]:
         factor = self._supersample
         height, width = shape.output_size
@@ -308,17 +359,18 @@ class Renderer:
             return held
         preparation = self._free_preparation(shape)
         if preparation is None:
-            preparation = compile(_preparation_program(shape, self.device.traits.is_cpu), self.device)
+            make = _preparation_program if self._planned else _inverse_depth_program
+            preparation = compile(make(shape, self.device.traits.is_cpu), self.device)
         pool = self.device.pool
         color, depth = pool.to_device(frame.color, "upload color"), pool.to_device(frame.depth, "upload depth")
         first, scale = bin_scale(frame)
         submission = preparation.submit(
             {"color": color.buffer, "depth": depth.buffer},
-            {"first_bin": np.float32(first), "bin_scale": np.float32(scale)},
+            {"first_bin": np.float32(first), "bin_scale": np.float32(scale)} if self._planned else {},
             [*color.waits, *depth.waits],
         )
         pool.free_input(depth, submission.event)
-        stats = _ComingStats(frame, shape, preparation, pool, submission.event)
+        stats = _ComingStats(frame, shape, preparation, pool, submission.event) if self._planned else None
         held = _DeviceFrame(frame, shape, {"color": color}, preparation, submission.event, stats)
         self._frames[key] = held
         return held
@@ -355,13 +407,13 @@ class Renderer:
                 old.preparation.close()
         return preparation
 
-    def _ring(self, shape: FrameShape, plan: Plan) -> FrameRing:
-        key = (shape, plan.structure)
+    def _ring(self, shape: FrameShape, plan: FramePlan) -> FrameRing:
+        key = (self.method, shape, plan.structure)
         ring = self._rings.get(key)
         if ring is None:
             while len(self._rings) >= _KEPT_PROGRAMS:
                 self._rings.popitem(last=False)[1].close()
-            program = self.method.program(shape, plan, self.device.traits)
+            program = planned_program(self.method, shape, plan, self.device.traits)
             if self._supersample > 1:
                 program = _resolved(program, self._image_size(shape), self._supersample)
             ring = FrameRing(program, self.device, self._slots)
@@ -395,7 +447,7 @@ def _preparation_program(shape: FrameShape, is_cpu: bool) -> FrameProgram:
     return FrameProgram.of([*program.buffers.values(), *buffers], [*program.passes, *passes])
 
 
-def _inverse_depth_program(shape: FrameShape) -> FrameProgram:
+def _inverse_depth_program(shape: FrameShape, is_cpu: bool = True) -> FrameProgram:
     slots = shape.layers * shape.height * shape.width
     rows = shape.layers * shape.height
     # Where the image is not opaque, nothing there is a surface at infinity without colour or alpha.

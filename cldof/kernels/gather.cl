@@ -17,6 +17,9 @@ typedef struct {
 
 static inline float absolute(float v) { return v < 0.0f ? -v : v; }
 
+/* Rounded before the pixel's place is added, so that it does not depend on that. */
+static inline int nearest(float v) { return (int)(v + (v < 0.0f ? -0.5f : 0.5f)); }
+
 /* gather_blur: mean over samples of the pixel's own CoC.
  * source  Potmesil & Chakravarty 1981 for the CoC; Scheuermann 2004, "Advanced Depth of Field", for leaving out sharp
  *         samples in front
@@ -40,8 +43,8 @@ __kernel void gather_blur(__global float *restrict out, const __global float *re
         float total = 0.0f;
         if (radius >= 0.5f) { /* else all samples are this pixel */
             for (int k = 0; k < count; k++) {
-                int qx = clamp_index((int)((float)x + radius * samples[3 * k] + 0.5f), size.width - 1);
-                int qy = clamp_index((int)((float)y + radius * samples[3 * k + 1] + 0.5f), size.height - 1);
+                int qx = clamp_index(x + nearest(radius * samples[3 * k]), size.width - 1);
+                int qy = clamp_index(y + nearest(radius * samples[3 * k + 1]), size.height - 1);
                 const size_t q = (size_t)qy * size.pitch + qx;
                 float weight = 1.0f;
 #if GATHER_DEPTH_AWARE

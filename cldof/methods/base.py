@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+import math
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..frame import LayeredFrame
 from ..host.device import Traits
 from ..host.passes import FrameProgram
 from ..lens import Lens
 
-__all__ = ["FrameShape", "Method", "Plan", "row_pitch", "struct_scalar"]
+__all__ = ["FrameShape", "Locality", "Method", "Plan", "row_pitch", "struct_scalar"]
+
+Array = NDArray[np.float64]
 
 
 class FrameShape(NamedTuple):
@@ -89,6 +93,45 @@ class Plan:
     summary: Mapping[str, Any]
 
 
+@dataclass(frozen=True)
+class Locality:
+    """How far a method looks, and what it makes of what is nearly in focus: what the planner may leave out.
+
+    Attributes
+    ----------
+    align_px : int
+        A part of a frame that begins at a multiple of this is computed as within the whole frame.
+    margin_px : int
+        Pixels around a part on which its result depends.
+    reach_px : callable
+        By how many pixels light of a slot may spread, from its CoC radius in px; arrays in, arrays out.
+    leak : callable
+        Share of a pixel's light that may come from elsewhere, from the pixel's CoC radius, as long as no nearer surface
+        reaches it. 0: it is the pinhole's pixel.
+    spreads : bool
+        False where a blurred surface never covers what is in focus beside it.
+    tail : float
+        Light that lies beyond ``reach_px`` and ``margin_px``, as a share.
+    closed_step_px : float
+        A surface hides what is behind it where its CoC changes by no more than this from one pixel to the next.
+    counts_slopes : bool
+        Whether a slot reaches as far in depth as its neighbours, as to ``leak``.
+    guesses_nearer_than_px : float
+        Where all that a column of pixels holds has a signed CoC below this, the method guesses what is behind it from
+        all around; such places are not taken apart. -inf: it never guesses.
+    """
+
+    align_px: int
+    margin_px: int
+    reach_px: Callable[[Array], Array]
+    leak: Callable[[Array], Array]
+    spreads: bool = True
+    tail: float = 0.0
+    closed_step_px: float = 0.0
+    counts_slopes: bool = False
+    guesses_nearer_than_px: float = -math.inf
+
+
 class Method(Protocol):
     """A depth-of-field method: turns lens and frame into passes, and owns no OpenCL object.
 
@@ -107,4 +150,8 @@ class Method(Protocol):
 
     def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
         """Declare the passes; depends on ``plan.structure`` only."""
+        ...
+
+    def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality | None:
+        """What the planner may take apart, if a share ``tail`` of a slot's light may be ignored; None for nothing."""
         ...

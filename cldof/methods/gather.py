@@ -20,7 +20,7 @@ from ..frame import LayeredFrame
 from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Param, Pass, Role, read, write
 from ..lens import Lens, lens_samples
-from .base import FrameShape, Plan, struct_scalar
+from .base import FrameShape, Locality, Plan, struct_scalar
 from .pyramid import SIZE as FLATTEN_SIZE
 
 __all__ = ["Gather", "gather_samples"]
@@ -59,8 +59,26 @@ class Gather:
     def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
         """Nothing to decide: the passes are the same for all lenses."""
         c1, c0 = lens.coc_coefficients(frame.camera)
-        summary = {"method": self.name, **{field.name: getattr(self, field.name) for field in fields(self)}}
+        farthest, nearest = frame.inverse_depth_range
+        if not frame.is_opaque:
+            farthest = 0.0  # the void is a surface at infinity
+        summary = {
+            "method": self.name,
+            **{field.name: getattr(self, field.name) for field in fields(self)},
+            "largest_coc_px": max(abs(c1 * farthest + c0), abs(c1 * nearest + c0)),
+        }
         return Plan((), {"c1": np.float32(c1), "c0": np.float32(c0)}, summary)
+
+    def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality:
+        """Each pixel looks at its own CoC and nothing reaches it from outside; below half a pixel it is itself."""
+        return Locality(
+            align_px=16,
+            margin_px=math.ceil(plan.summary["largest_coc_px"]) + 2,
+            reach_px=lambda coc: coc,
+            leak=lambda coc: np.where(coc < 0.5, 0.0, 1.0),
+            spreads=False,
+            closed_step_px=math.inf,
+        )
 
     def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
         """Compose all peels, then gather."""

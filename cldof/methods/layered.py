@@ -39,7 +39,7 @@ from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Local, Param, Pass, Role, read, read_write, write
 from ..lens import GAUSSIAN_SIGMA, Lens
 from . import gaussian
-from .base import FrameShape, Plan, struct_scalar
+from .base import Array, FrameShape, Locality, Plan, struct_scalar
 
 __all__ = ["MAX_LAYERS", "LayerStack", "Layered", "matting_functions"]
 
@@ -164,6 +164,13 @@ class Layered:
 
     def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
         """Choose K, the focus layer and the step from the CoC range; derive the matting functions."""
+        return self._plan(frame, lens, both_sides=False)
+
+    def plan_both_sides(self, frame: LayeredFrame, lens: Lens) -> Plan:
+        """The same with as many layers on the side with less blur as on the other, empty ones: for comparison."""
+        return self._plan(frame, lens, both_sides=True)
+
+    def _plan(self, frame: LayeredFrame, lens: Lens, both_sides: bool) -> Plan:
         c1, c0 = lens.coc_coefficients(frame.camera)
         farthest, nearest = frame.inverse_depth_range
         if not frame.is_opaque:
@@ -171,13 +178,21 @@ class Layered:
         near_px, far_px = max(0.0, -(c1 * nearest + c0)), max(0.0, c1 * farthest + c0)
         stack = self._stack(near_px, far_px)
         coc = layer_coc(stack)
+        before = 0
+        if both_sides:
+            most = max(stack.front, stack.back)
+            before = min(most - stack.front, MAX_LAYERS - stack.total)
+            after = min(most - stack.back, MAX_LAYERS - stack.total - before)
         params = np.zeros((), _MATTING)
-        params["layer"][: stack.total] = matting_functions(coc, c1, c0, self.matting)
+        there = slice(before, before + stack.total)
+        params["layer"][there] = matting_functions(coc, c1, c0, self.matting)
         sigma = GAUSSIAN_SIGMA * np.abs(coc)
         # Neighbouring layers blur by different amounts: their seam and a surface's breadth go by the greater.
         sigma[1:] = np.maximum(sigma[1:], sigma[:-1])
-        params["reach"][: stack.total] = _SEAM_REACH * sigma
-        params["around"][: stack.total] = np.maximum(1, np.rint(sigma))
+        params["reach"][there] = _SEAM_REACH * sigma
+        params["around"][there] = np.maximum(1, np.rint(sigma))
+        if both_sides:
+            stack = LayerStack(before + stack.front, stack.back + after, stack.sigma_step)
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},
@@ -194,6 +209,39 @@ class Layered:
         stack = plan.structure
         assert isinstance(stack, LayerStack)
         return _Builder(self, shape, stack, traits).build()
+
+    def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality:
+        """A slot is blurred as the layer beyond it; in front of the layer in focus stands what is out of it."""
+        stack = plan.structure
+        assert isinstance(stack, LayerStack)
+        if stack.total == 1:
+            return Locality(_TILE, 0, np.zeros_like, np.zeros_like)
+        is_recursive = _Engines(self, traits).is_recursive
+        coc = np.abs(layer_coc(stack))
+        sides = [coc[stack.front :: -1], coc[stack.front :]]
+        longest = max(sides, key=len)
+        steps = tuple(stack.sigma_step * n for n in range(1, len(longest)))
+        if not self.cascade:
+            reaches = [
+                _reach(((GAUSSIAN_SIGMA * float(c), is_recursive(GAUSSIAN_SIGMA * float(c))),), tail)
+                for c in longest[1:]
+            ]
+        else:
+            engines = tuple((sigma, is_recursive(sigma)) for sigma in steps)
+            reaches = [_reach(engines[: n + 1], tail) for n in range(len(engines))]
+        reach = np.array([0.0, *reaches])
+        # To what is in front of a pixel, and from there to what shows where it lets light through, once.
+        around = math.ceil(GAUSSIAN_SIGMA * float(longest[-1])) + 2
+
+        def reach_px(coc_px: Array) -> Array:
+            return np.asarray(reach[np.minimum(np.searchsorted(longest, coc_px), len(longest) - 1)])
+
+        def leak(coc_px: Array) -> Array:
+            # Published anchors blur even what is in focus.
+            share = 2.0 * coc_px / longest[1] if self.matting == "seamless" else np.ones_like(coc_px)
+            return np.minimum(share, 1.0)
+
+        return Locality(_TILE, int(reach[-1]) + around, reach_px, leak, tail=tail)
 
     def _stack(self, near_px: float, far_px: float) -> LayerStack:
         """The fewest layers that reach both ends of the CoC range, with the step enlarged until they are few enough."""
@@ -278,6 +326,24 @@ def matting_functions(coc: NDArray[np.float64], c1: float, c0: float, matting: s
     return functions
 
 
+@lru_cache(maxsize=512)
+def _reach(blurs: tuple[tuple[float, bool], ...], tail: float) -> int:
+    """Pixels along an axis within which all but ``tail`` of a cascade's light stays; (sigma, is recursive) by blur."""
+    kernel = np.ones(1)
+    for sigma, is_recursive in blurs:
+        if is_recursive:
+            pole, gain = gaussian.iir_sections(sigma)[:, :4].astype(np.float64).view(np.complex128).T
+            distance = np.abs(np.arange(-math.ceil(12 * sigma), math.ceil(12 * sigma) + 1))
+            taps = np.abs((gain * pole ** distance[:, None]).real.sum(axis=1))
+        else:
+            taps = gaussian.fir_taps(sigma)
+        kernel = np.convolve(kernel, taps)
+    radius = len(kernel) // 2
+    # Outside of +-r along one axis or the other.
+    outside = 2.0 * (1.0 - np.cumsum(kernel[radius:] * np.where(np.arange(radius + 1) > 0, 2.0, 1.0)) / kernel.sum())
+    return int(np.searchsorted(-outside, -tail))
+
+
 class _Taps:
     """All FIR taps of a frame in one buffer."""
 
@@ -309,14 +375,35 @@ class _Image(NamedTuple):
     sigma: float
 
 
+class _Engines:
+    """Which blurs are recursive on a device."""
+
+    def __init__(self, method: Layered, traits: Traits) -> None:
+        self.method, self.local_limit = method, traits.local_mem_bytes
+        self.blocking = _CPU_BLOCKING if traits.is_cpu else _GPU_BLOCKING
+
+    def is_recursive(self, sigma: float) -> bool:
+        if sigma <= 0.0:
+            return False
+        fits = self.blocking.lines_bytes(gaussian.fir_radius(sigma)) + 256 <= self.local_limit
+        if self.method.engine == "fir" and not fits:
+            raise InputError(
+                f"layered: engine='fir' cannot blur by sigma {sigma:.1f} px on this device: its local memory of "
+                f"{self.local_limit} bytes is too small. Use engine='auto'."
+            )
+        if self.method.engine == "auto":
+            return sigma > self.blocking.largest_fir_sigma or not fits
+        return self.method.engine == "iir"
+
+
 class _Builder:
     """Lists the passes of one frame."""
 
     def __init__(self, method: Layered, shape: FrameShape, stack: LayerStack, traits: Traits) -> None:
         self.method, self.shape, self.stack = method, shape, stack
-        blocking = _CPU_BLOCKING if traits.is_cpu else _GPU_BLOCKING
+        self.engines = _Engines(method, traits)
+        self.blocking = blocking = self.engines.blocking
         self.local_size = min(blocking.local_size, traits.max_work_group_size)
-        self.blocking, self.local_limit = blocking, traits.local_mem_bytes
         self.tiles_x, self.tiles_y = -(-shape.width // _TILE), -(-shape.height // blocking.rows)
         self.size = struct_scalar(
             _SIZE, shape.width, shape.height, shape.pitch, shape.layers, self.tiles_x, self.tiles_y
@@ -411,7 +498,7 @@ class _Builder:
 
     def _step(self, name: str, layer: int, image: _Image, in_front: bool, sigma: float) -> _Image:
         """Compose one layer with what there is and blur both."""
-        recursive = self._is_recursive(sigma)
+        recursive = self.engines.is_recursive(sigma)
         radius_in, taps_in = self.taps.centre(image.sigma)
         row_sigma = 0.0 if recursive else sigma
         radius_out, taps_out = self.taps.centre(row_sigma)
@@ -507,19 +594,6 @@ class _Builder:
             (self.local_size, 1),
             traffic_bytes=self.pixels * 16 * (1 + bool(front.below) + bool(back.below)),
         )
-
-    def _is_recursive(self, sigma: float) -> bool:
-        if sigma <= 0.0:
-            return False
-        fits = self.blocking.lines_bytes(gaussian.fir_radius(sigma)) + 256 <= self.local_limit
-        if self.method.engine == "fir" and not fits:
-            raise InputError(
-                f"layered: engine='fir' cannot blur by sigma {sigma:.1f} px on this device: its local memory of "
-                f"{self.local_limit} bytes is too small. Use engine='auto'."
-            )
-        if self.method.engine == "auto":
-            return sigma > self.blocking.largest_fir_sigma or not fits
-        return self.method.engine == "iir"
 
     def _image_buffer(self, name: str) -> None:
         self.buffers.append(Buffer(name, self.image_bytes))

@@ -29,7 +29,7 @@ from ..frame import LayeredFrame
 from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
 from ..lens import Aperture, Lens
-from .base import FrameShape, Plan, row_pitch, struct_scalar
+from .base import FrameShape, Locality, Plan, row_pitch, struct_scalar
 
 __all__ = ["MAX_VIEWS", "LightField", "Views", "lens_views"]
 
@@ -171,6 +171,21 @@ class LightField:
             "largest_coc_px": largest,
         }
         return Plan(Views(count, lens.aperture, levels), {"lens": params[()]}, summary)
+
+    def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality | None:
+        """Slots move by their CoC. Random pixels depend on their place in the image, so then nothing can be said."""
+        views = plan.structure
+        assert isinstance(views, Views)
+        if self.lookup == "jitter":
+            return None
+        mips = 4 * 2**views.levels if views.levels else 0
+        step = 1.0 / 512.0  # slots that move by less stay where they are
+        return Locality(
+            align_px=max(64, 2**views.levels),
+            margin_px=int(plan.params["lens"]["reach"]) + mips + 2 * _TILE,
+            reach_px=lambda coc: coc + _FOOTPRINT_PX + mips,
+            leak=lambda coc: np.where(coc < step, 2.0 * coc, np.minimum(3.0 * coc + 2.0 / views.total, 1.0)),
+        )
 
     def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
         """Declare the frame's passes."""

@@ -30,7 +30,7 @@ from ..frame import LayeredFrame
 from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
 from ..lens import Aperture, Lens
-from .base import FrameShape, Plan, struct_scalar
+from .base import FrameShape, Locality, Plan, struct_scalar
 from .shading import shading_inputs, split_pass, view_pass
 
 __all__ = ["CELL", "MAX_LAYERS", "MAX_RAYS", "Cone", "LensLayers", "Multiview", "RaySets", "cones", "ray_sets"]
@@ -220,6 +220,26 @@ class Multiview:
         if layers.eyes:
             params["aperture_radius_m"] = np.float32(lens.aperture_radius_m)
         return Plan(layers, params, summary)
+
+    def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality | None:
+        """Rays go no farther than their CoC; those of the layer in focus do not leave their pixel.
+
+        Shading from the points of the lens depends on the place in the image, also in focus.
+        """
+        layers = plan.structure
+        assert isinstance(layers, LensLayers)
+        if layers.eyes:
+            return None
+        largest = layers.delta_px * (max(layers.front, layers.back) + 1)
+        cone = _HALO if self.has_cones else 0
+        return Locality(
+            align_px=_RUN,
+            # Cells look for layers in whole cells around them.
+            margin_px=math.ceil(largest) + cone + 3 * CELL,
+            reach_px=lambda coc: coc + layers.delta_px + cone + 2.0,
+            leak=lambda coc: np.where(coc < 0.49 * layers.delta_px, 0.0, 1.0),
+            counts_slopes=True,
+        )
 
     def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
         """Declare the frame's passes."""

@@ -32,7 +32,7 @@ from ..frame import LayeredFrame
 from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Local, Param, Pass, Role, read, read_write, write
 from ..lens import GAUSSIAN_SIGMA, Lens
-from .base import FrameShape, Plan, row_pitch
+from .base import Array, FrameShape, Locality, Plan, row_pitch
 
 __all__ = ["MAX_STEPS", "SIZE", "Pyramid", "SubImages", "blur_radius", "level_table", "matting_functions"]
 
@@ -151,6 +151,13 @@ class Pyramid:
 
     def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
         """Choose the sub-images from the CoC range; derive the matting functions."""
+        return self._plan(frame, lens, both_sides=False)
+
+    def plan_both_sides(self, frame: LayeredFrame, lens: Lens) -> Plan:
+        """The same with as many sub-images on the side with less blur as on the other, empty ones: for comparison."""
+        return self._plan(frame, lens, both_sides=True)
+
+    def _plan(self, frame: LayeredFrame, lens: Lens, both_sides: bool) -> Plan:
         c1, c0 = lens.coc_coefficients(frame.camera)
         farthest, nearest = frame.inverse_depth_range
         if not frame.is_opaque:
@@ -161,8 +168,15 @@ class Pyramid:
         paper = self.matting == "paper"
         matting = matting_functions(chosen, last, self._radius, c1, c0, paper)
         params = np.zeros((), _MATTING)
-        params["ramp"][: len(chosen.indices)] = matting.ramp
-        params["seam"][: len(chosen.indices)] = matting.seam
+        before = 0
+        if both_sides:
+            most = max(-chosen.first, chosen.last)
+            before = most + chosen.first
+        there = slice(before, before + len(chosen.indices))
+        params["ramp"][there] = matting.ramp
+        params["seam"][there] = matting.seam
+        if both_sides:
+            chosen = SubImages(-most, most)
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},
@@ -179,6 +193,37 @@ class Pyramid:
         chosen = plan.structure
         assert isinstance(chosen, SubImages)
         return _Builder(self, shape, chosen, traits).build()
+
+    def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality:
+        """A slot is blurred as the sub-image beyond it, and holes are filled from around them."""
+        chosen = plan.structure
+        assert isinstance(chosen, SubImages)
+        steps = max(-chosen.first, chosen.last)
+        if steps == 0:
+            return Locality(_MARGIN, 0, np.zeros_like, np.zeros_like)
+        sigmas = np.array([blur_radius(n) if self.radius == "fitted" else self._radius(n) for n in range(steps + 1)])
+
+        def reach_px(coc_px: Array) -> Array:
+            index = np.minimum(np.searchsorted(sigmas, GAUSSIAN_SIGMA * coc_px), steps)
+            # Reductions widen a pixel by 1.5 pixels of the coarsest level, expansions by 2.
+            return np.where(index > 0, 3.5 * 2.0**index + 2.0, 0.0)
+
+        def leak(coc_px: Array) -> Array:
+            share = 2.0 * GAUSSIAN_SIGMA * coc_px / sigmas[1] if self.matting == "seamless" else np.ones_like(coc_px)
+            return np.minimum(share, 1.0)
+
+        # What lies beyond the frame's edges is always a hole, as wide as the margin; pulling and pushing fills a hole
+        # from at most six times its width.
+        return Locality(
+            max(64, 2**steps),
+            8 * 2**steps + _MARGIN,
+            reach_px,
+            leak,
+            # The farthest sub-image culls most.
+            guesses_nearer_than_px=self._radius(chosen.last - 2) / GAUSSIAN_SIGMA
+            if self.hidden == "peels" and self.normalise
+            else math.inf,
+        )
 
     def _radius(self, i: int) -> float:
         factor = self.perceived_blur if self.radius == "paper" else None
