@@ -274,7 +274,8 @@ def test_closing_the_aperture_ends_in_the_pinhole_image_bit_for_bit(method: str,
     assert images[-1] == pytest.approx(frame.pinhole_image(), abs=1e-6)
     steps = [float(np.abs(image - pinhole).mean()) for image in images]
     assert steps[0] > 0.001 and steps[-1] == 0.0
-    assert all(later <= earlier for earlier, later in pairwise(steps))
+    # Means of equal pixels may differ from the pixel by rounding.
+    assert all(later <= earlier + 1e-6 for earlier, later in pairwise(steps))
 
 
 @pytest.mark.parametrize("in_flight", [1, 2, 3])
