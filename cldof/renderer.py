@@ -6,6 +6,8 @@ import math
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Any
@@ -17,6 +19,7 @@ from .errors import CldofError, DeviceError, InputError
 from .frame import LayeredFrame
 from .host.buffers import BufferPool, HostInput
 from .host.device import Device
+from .host.launch import driver_errors
 from .host.passes import Buffer, FrameProgram, Pass, Role, read, write
 from .host.profile import PassTiming, pass_timings
 from .host.scheduler import Batch, FrameRing, Submission, compile
@@ -122,8 +125,10 @@ class PendingResult:
         plan: FramePlan,
         started: float,
         profile: bool,
+        report: Callable[[], None],
     ) -> None:
         self._submission, self._event, self._image, self._plan = submission, event, image, plan
+        self._report = report  # tells the renderer that the frame failed
         self._started, self._profile = started, profile
         self._result: Result | None = None
 
@@ -140,8 +145,13 @@ class PendingResult:
             The device failed on the way.
         """
         if self._result is None:
-            self._submission.wait()
-            self._event.wait()
+            try:
+                with driver_errors("a frame did not arrive"):
+                    self._submission.wait()
+                    self._event.wait()
+            except DeviceError:
+                self._report()
+                raise
             wall_ms = (time.perf_counter() - self._started) * 1e3
             timings = pass_timings(self._submission) if self._profile else []
             self._result = Result(self._image, timings, wall_ms, self._plan)
@@ -224,6 +234,7 @@ class Renderer:
         # Recent frames by identity; holding the frame keeps the identity from being used again.
         self._frames: OrderedDict[int, _DeviceFrame] = OrderedDict()
         self._closed = False
+        self._has_failed = False
 
     def render(self, frame: LayeredFrame, lens: Lens, out: NDArray[np.float32] | None = None) -> Result:
         """Render one frame and wait for it.
@@ -262,9 +273,7 @@ class Renderer:
             )
         shape = FrameShape.of(frame)
         image = _output_array(out, (*self._image_size(shape), 4))
-        with self._lock:
-            if self._closed:
-                raise DeviceError("This renderer is closed; make a new one.")
+        with self._turn():
             held = self._upload(frame, shape)
             plan = self._plan(held, lens)
             ring = self._ring(shape, plan)
@@ -274,7 +283,7 @@ class Renderer:
             output = "image" if self._supersample == 1 else "resolved"
             download = self.device.pool.download(submission.batch.output(output), image, [submission.event])
             submission.batch.hold(download)
-        return PendingResult(submission, download, image, plan, started, self.device.is_profiling)
+        return PendingResult(submission, download, image, plan, started, self.device.is_profiling, self._note_failure)
 
     def stats(self, frame: LayeredFrame) -> SceneStats:
         """What the planner knows of a frame; uploads it, if need be, and waits for the answer.
@@ -284,9 +293,7 @@ class Renderer:
         DeviceError
             The device failed or has not enough memory.
         """
-        with self._lock:
-            if self._closed:
-                raise DeviceError("This renderer is closed; make a new one.")
+        with self._turn():
             held = self._upload(frame, FrameShape.of(frame))
             if held.stats is None:
                 raise InputError("This renderer was made with planned=False and gathers no statistics.")
@@ -303,14 +310,12 @@ class Renderer:
             if self._closed:
                 return
             self._closed = True
-            self.device.finish()
-            for ring in self._rings.values():
-                ring.close()
-            for held in self._frames.values():
-                held.preparation.close()
-            self._rings.clear()
-            self._frames.clear()
-            self.device.close()
+            try:
+                self.device.finish()
+            finally:
+                self._rings.clear()
+                self._frames.clear()
+                self.device.close()  # with all of its memory
 
     def __enter__(self) -> Renderer:
         return self
@@ -339,6 +344,39 @@ class Renderer:
                 held.plans.pop(next(iter(held.plans)))
             held.plans[key] = plan
         return plan
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        """One call at a time. What fails half-way, an interrupt included, leaves a renderer that makes all things anew.
+
+        Refused input leaves everything as it was.
+        """
+        with self._lock:
+            if self._closed:
+                raise DeviceError("This renderer is closed; make a new one.")
+            if self._has_failed:
+                self._start_afresh()
+            try:
+                with driver_errors(f"a frame failed on {self.device.info.name}"):
+                    yield
+            except InputError:
+                raise
+            except BaseException:
+                self._start_afresh()
+                raise
+
+    def _note_failure(self) -> None:
+        self._has_failed = True
+
+    def _start_afresh(self) -> None:
+        """Forget what may be half done, once nothing uses it any more; frames on their way still arrive."""
+        self._has_failed = True
+        with suppress(DeviceError):
+            self.device.finish()
+        self._rings.clear()
+        self._frames.clear()
+        self.device.pool.clear()
+        self._has_failed = False
 
     def _image_size(self, shape: FrameShape) -> tuple[int, int]:
         factor = self._supersample

@@ -143,13 +143,17 @@ class BufferPool:
                 buffer.release()  # the driver keeps the memory until enqueued commands are done with it
         self._free.clear()
 
-    def close(self) -> None:
-        """Release every buffer, handed out or not."""
+    def clear(self) -> None:
+        """Release every buffer, handed out or not. Those who hold one must not use it, nor give it back."""
         self.trim()
         for buffer in self._in_use.values():
             buffer.release()
         self._in_use.clear()
         self.allocated_bytes = self.in_use_bytes = 0
+
+    def close(self) -> None:
+        """As :meth:`clear`, and no buffer is handed out any more."""
+        self.clear()
         self._closed = True
 
     def to_device(self, array: NDArray[Any], label: str = "upload", waits: Sequence[Any] = ()) -> HostInput:

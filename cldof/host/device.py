@@ -289,7 +289,12 @@ class Device:
             program._build(options=b"", devices=[self._cl_device])
             kernel = cl.Kernel(program, "probe")
         except cl.Error as error:
-            raise DeviceError(f"{self.info.name} cannot compile the smallest kernel: {error}") from error
+            advice = ""
+            if Effect.DRIVER_CACHES_BUILDS in effects_of(self.info.platform, self.info.name):
+                advice = ". Its cache of programs may be damaged or its disk full: delete the cache"
+                if folder := os.environ.get("POCL_CACHE_DIR"):
+                    advice += f" in {folder}"
+            raise DeviceError(f"{self.info.name} cannot compile the smallest kernel: {error}{advice}.") from error
         size: int = self._cl_device.max_work_group_size
         while size > 1:
             if self._group_works(kernel, size):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from ..errors import DeviceError
 from . import opencl as cl
 
-__all__ = ["Launched", "launch"]
+__all__ = ["Launched", "driver_errors", "launch"]
 
 
 class Launched(NamedTuple):
@@ -16,6 +17,15 @@ class Launched(NamedTuple):
 
     label: str
     event: Any
+
+
+@contextmanager
+def driver_errors(what: str) -> Iterator[None]:
+    """Whatever the driver raises inside the block is a :class:`~cldof.DeviceError` that begins with `what`."""
+    try:
+        yield
+    except cl.Error as error:
+        raise DeviceError(f"{what}: {error}. The device may have run out of memory or be lost.") from error
 
 
 def launch(

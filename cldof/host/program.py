@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..errors import BuildError, InputError, OutputError
+from ..errors import BuildError, DeviceError, InputError, OutputError
 from ..files import atomic_write
 from . import opencl as cl
 from .quirks import Effect, effects_of, user_cache_dir
@@ -138,6 +138,8 @@ class ProgramCache:
             return cl.Kernel(program, name)
         except cl.Error as error:
             found = sorted(program.get_info(cl.program_info.KERNEL_NAMES).split(";"))
+            if name in found:
+                raise DeviceError(f"{self._device.name.strip()} cannot make a kernel of {name!r}: {error}") from error
             raise BuildError(f"{stem}.cl has no kernel {name!r}; it has {', '.join(found) or 'none'}") from error
 
     def program(self, stem: str, defines: Defines = ()) -> Any:

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import os
+import shutil
+import struct
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
 __all__ = ["QUIRKS", "Effect", "Quirk", "effects_of", "prepare_environment", "user_cache_dir"]
+
+
+# Room that a cache of programs needs: those of all methods take 5 MB.
+_CACHE_BYTES = 32 << 20
 
 
 class Effect(Enum):
@@ -100,13 +107,16 @@ def prepare_environment() -> None:
     """Give PoCL a cache directory that it can write to; runs before pyopencl is imported.
 
     Without one, PoCL 3.0 either reports no device at all (home directory missing or read-only, as in many containers)
-    or fails every build. Only a directory that cannot work is replaced, and only where the user set nothing that works.
+    or fails every build; on a full disk, or when it finds a program that was cut short, it ends the process. Only a
+    directory that cannot work is replaced, and only where the user set nothing that works.
     """
     chosen = os.environ.get("POCL_CACHE_DIR")
     directory = user_cache_dir() if chosen is None else Path(chosen)
     if not _can_hold_files(directory):
         owner = os.getuid() if hasattr(os, "getuid") else "user"
-        os.environ["POCL_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"cldof-pocl-{owner}")
+        directory = Path(tempfile.gettempdir()) / f"cldof-pocl-{owner}"
+        os.environ["POCL_CACHE_DIR"] = str(directory)
+    _drop_cut_programs(directory / "pocl" / "kcache" if "POCL_CACHE_DIR" not in os.environ else directory)
 
 
 def user_cache_dir() -> Path:
@@ -120,8 +130,34 @@ def user_cache_dir() -> Path:
 
 
 def _can_hold_files(directory: Path) -> bool:
-    """Whether files can be made in it, or it and its parents can be made. Makes nothing itself."""
+    """Whether files can be made in it, or it and its parents can be made, and there is room. Leaves nothing behind."""
     for path in (directory, *directory.parents):
         if path.exists():
-            return path.is_dir() and os.access(path, os.W_OK | os.X_OK)
+            try:
+                # Tried, since permissions tell little to root and of file systems that take no files.
+                with tempfile.TemporaryFile(dir=path):
+                    return shutil.disk_usage(path).free >= _CACHE_BYTES
+            except OSError:
+                return False
     return False
+
+
+def _drop_cut_programs(directory: Path) -> None:
+    """Remove programs that end before their table of sections does, as a power failure or a full disk leaves them."""
+    for folder, _, names in os.walk(directory):
+        for name in names:
+            if name.endswith(".so"):
+                with suppress(OSError):
+                    _drop_if_cut(os.path.join(folder, name))
+
+
+def _drop_if_cut(path: str) -> None:
+    with open(path, "rb") as file:
+        head, size = file.read(64), os.fstat(file.fileno()).st_size
+    if len(head) == 64 and head[:5] != b"\x7fELF\x02":
+        return  # not one of 64-bit Linux
+    if len(head) == 64:
+        (table,) = struct.unpack_from("<Q", head, 40)
+        entry_bytes, entries = struct.unpack_from("<HH", head, 58)
+    if len(head) < 64 or table + entry_bytes * entries > size:
+        os.unlink(path)

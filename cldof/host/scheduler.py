@@ -16,7 +16,7 @@ from ..errors import DeviceError, InputError
 from . import hazards
 from . import opencl as cl
 from .device import Device
-from .launch import Launched, launch
+from .launch import Launched, driver_errors, launch
 from .passes import Access, FrameProgram, Local, Mode, Param, Pass, Role
 
 __all__ = ["Batch", "FrameRing", "Submission", "compile"]
@@ -88,7 +88,8 @@ def compile(program: FrameProgram, device: Device) -> Batch:
         The device lacks the memory or the work-group size.
     """
     hazards.check(program)
-    return Batch(program, device)
+    with driver_errors(f"a frame cannot be made ready on {device.info.name}"):
+        return Batch(program, device)
 
 
 class Batch:
@@ -159,23 +160,24 @@ class Batch:
         if self._closed:
             raise InputError("a frame was submitted to a batch that is closed")
         inputs = inputs if inputs is not None else {}
-        self._bind(inputs)
-        self._set(params if params is not None else {})
-        before = [*wait_for, *self._users]
-        if self._last is not None and self.device.is_out_of_order:
-            before.append(self._last)
-        self._users.clear()
-        try:
-            launched = self._enqueue(before)
-            event = self._completion(launched)
-        except DeviceError:
-            # Half a frame is on its way, and nothing else would wait for it.
-            with suppress(cl.Error):
-                self.device.queue.finish()
-            raise
-        self.device.queue.flush()
-        self._last = event
-        self._keep_until_done(event, tuple(inputs.values()))
+        with driver_errors(f"a frame cannot be started on {self.device.info.name}"):
+            self._bind(inputs)
+            self._set(params if params is not None else {})
+            before = [*wait_for, *self._users]
+            if self._last is not None and self.device.is_out_of_order:
+                before.append(self._last)
+            try:
+                launched = self._enqueue(before)
+                event = self._completion(launched)
+                self.device.queue.flush()
+                self._last = event
+                self._users.clear()
+                self._keep_until_done(event, tuple(inputs.values()))
+            except BaseException:
+                # Half a frame is on its way, and nothing else would wait for it.
+                with suppress(cl.Error):
+                    self.device.queue.finish()
+                raise
         return Submission(event, tuple(launched) if self.device.is_profiling else (), self)
 
     def hold(self, event: Any) -> None:
@@ -295,6 +297,7 @@ class Batch:
             needed = self.program.buffers[name].nbytes
             if buffer.size < needed:
                 raise InputError(f"input {name!r} is bound to a buffer of {buffer.size} bytes; it needs {needed}")
+            self._bound.pop(name, None)  # until all of its kernels have the new one
             for kernel, index in self._input_uses[name]:
                 kernel.set_arg(index, buffer)
             self._bound[name] = buffer
@@ -471,6 +474,7 @@ class _Parameter:
         data = self._encoded(value)
         if data == self._bytes:
             return
+        self._bytes = b""  # until all kernels have the new value
         for step, kernel, index in self.uses:
             _set_argument(step, kernel, index, data)
         self._bytes = data
