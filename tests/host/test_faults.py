@@ -1,7 +1,7 @@
 """What goes wrong on the way: the driver refuses, the device is lost, somebody presses Ctrl-C, a disk is full.
 
-Each fault is put in on purpose, at every place where it can happen: one clear error, the next frame is right to the last
-bit, and all memory that was in use for the failed frame is back.
+Each fault is put in on purpose, at every place where it can happen: one clear error, the next frame is right to the
+last bit, and all memory that was in use for the failed frame is back.
 """
 
 from __future__ import annotations
@@ -220,12 +220,8 @@ def test_a_lost_device_stays_a_clear_error(device_info: DeviceInfo, monkeypatch:
     renderer = Renderer("layered", device=device_info.index)
     pending = renderer.render_async(FRAMES[0], lens_for(FRAMES[0]))
     pending.result()
-    faults = [
-        Faulty(monkeypatch, owner, name, cl.RuntimeError)
-        for owner, name in (
-            (cl, "enqueue_nd_range_kernel"), (cl, "enqueue_copy"), (cl.CommandQueue, "finish"), (cl.CommandQueue, "flush")
-        )
-    ]  # fmt: skip
+    places = [(cl, "enqueue_nd_range_kernel"), (cl, "enqueue_copy"), (cl.CommandQueue, "finish")]
+    faults = [Faulty(monkeypatch, owner, name, cl.RuntimeError) for owner, name in places]
     for fault in faults:
         fault.break_after(0)
     for _ in range(3):
@@ -408,7 +404,7 @@ def test_a_full_disk_leaves_the_old_frame(tmp_path: Path, small_disk: None) -> N
     path = tmp_path / "frame.npz"
     noise_frame(3, 3, 1).save(path)
     before = path.read_bytes()
-    with pytest.raises(CldofError, match="frame.npz"):
+    with pytest.raises(CldofError, match=r"frame\.npz"):
         noise_frame(64, 64).save(path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["frame.npz"]
     assert path.read_bytes() == before
