@@ -5,14 +5,23 @@ from __future__ import annotations
 import os
 import shutil
 import struct
+import sys
 import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from typing import IO
+
+if sys.platform != "win32":
+    import fcntl
 
 __all__ = ["QUIRKS", "Effect", "Quirk", "effects_of", "prepare_environment", "user_cache_dir"]
 
+
+_MOST_PROCESSES = 64
+# Locks on directories, for as long as the process lives: the environment that they go with is the process's, too.
+_claimed: dict[Path, IO[bytes]] = {}
 
 # Room that a cache of programs needs: those of all methods take 5 MB.
 _CACHE_BYTES = 32 << 20
@@ -108,7 +117,8 @@ def prepare_environment() -> None:
 
     Without one, PoCL 3.0 either reports no device at all (home directory missing or read-only, as in many containers)
     or fails every build; on a full disk, or when it finds a program that was cut short, it ends the process. Only a
-    directory that cannot work is replaced, and only where the user set nothing that works.
+    directory that cannot work is replaced. Processes that build the same program at once crash now and then when they
+    share a directory, so a second process at the same time gets one below the first one's.
     """
     chosen = os.environ.get("POCL_CACHE_DIR")
     directory = user_cache_dir() if chosen is None else Path(chosen)
@@ -116,7 +126,12 @@ def prepare_environment() -> None:
         owner = os.getuid() if hasattr(os, "getuid") else "user"
         directory = Path(tempfile.gettempdir()) / f"cldof-pocl-{owner}"
         os.environ["POCL_CACHE_DIR"] = str(directory)
-    _drop_cut_programs(directory / "pocl" / "kcache" if "POCL_CACHE_DIR" not in os.environ else directory)
+    elif chosen is None:
+        directory = directory / "pocl" / "kcache"  # PoCL's own choice
+    own = _claim(directory)
+    if own != directory:
+        os.environ["POCL_CACHE_DIR"] = str(own)
+    _drop_cut_programs(own)
 
 
 def user_cache_dir() -> Path:
@@ -140,6 +155,29 @@ def _can_hold_files(directory: Path) -> bool:
             except OSError:
                 return False
     return False
+
+
+def _claim(directory: Path) -> Path:
+    """A directory that no other process of ours uses: this one, or a numbered one below; until the process ends."""
+    if sys.platform == "win32":
+        return directory
+    for number in range(_MOST_PROCESSES):
+        candidate = directory / f"cldof-{number}" if number else directory
+        if candidate in _claimed:
+            return candidate
+        try:
+            candidate.mkdir(parents=True, exist_ok=True)
+            lock = open(candidate / "cldof.lock", "wb")  # noqa: SIM115 - held until the process ends
+        except OSError:
+            break
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        _claimed[candidate] = lock
+        return candidate
+    return directory
 
 
 def _drop_cut_programs(directory: Path) -> None:

@@ -35,7 +35,6 @@ def test_a_cache_directory_that_works_is_left_alone(monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "not yet" / "there"))
     prepare_environment()
     assert os.environ["POCL_CACHE_DIR"] == str(tmp_path / "not yet" / "there")
-    assert not (tmp_path / "not yet").exists()
 
 
 @pytest.mark.parametrize("variable", ["POCL_CACHE_DIR", "XDG_CACHE_HOME", "HOME"])
