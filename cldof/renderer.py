@@ -288,8 +288,14 @@ class Renderer:
         else:
             self.device = Device.open(device, profiling=profile, out_of_order=out_of_order)
         self._slots = frames_in_flight
+        # A method may take in all samples of a pixel at once; otherwise they are rendered like pixels and averaged.
         self._supersample = supersample
         self._planned, self._max_change = planned, float(max_change)
+        if supersample > 1 and hasattr(self.method, "supersampled"):
+            self.method = self.method.supersampled(supersample)
+        self._taken_in = int(getattr(self.method, "supersample", 1))
+        if self._taken_in > 1:
+            self._supersample = 1
         self._lock = threading.Lock()
         self._rings: OrderedDict[Any, FrameRing] = OrderedDict()
         # Recent frames by identity; holding the frame keeps the identity from being used again.
@@ -450,7 +456,7 @@ class Renderer:
         self._has_failed = False
 
     def _image_size(self, shape: FrameShape) -> tuple[int, int]:
-        factor = self._supersample
+        factor = self._supersample * self._taken_in
         height, width = shape.output_size
         if height % factor or width % factor:
             raise InputError(
