@@ -5,7 +5,6 @@ from typing import Any
 
 from .camera import Camera
 from .errors import (
-    BudgetWarning,
     BuildError,
     CaptureError,
     CldofError,
@@ -24,7 +23,6 @@ __version__ = "0.1.0"
 __all__ = [
     "Ambient",
     "Aperture",
-    "BudgetWarning",
     "BuildError",
     "Camera",
     "CaptureError",

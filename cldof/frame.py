@@ -24,6 +24,8 @@ _SURFACE_CHANNELS = {"normal": 3, "albedo": 3, "specular": 3, "shininess": None}
 _SHADING = ("normal", "specular", "shininess")
 # Peels may repeat a depth (coplanar surfaces, sky behind sky) but never come nearer by more than rounding.
 _ORDER_TOLERANCE = 1e-6
+# Nearer than any surface; products of inverse depths with CoC coefficients and scales fit float32.
+_NEAREST_M = 1e-9
 # A column whose layers let through less than this is closed: float32 rounding of blended alphas.
 _OPAQUE_TOLERANCE = 1e-3
 
@@ -116,6 +118,10 @@ class LayeredFrame:
             _refuse(
                 self.depth <= 0.0, "depth", "zero or negative values; depth is planar, in metres, positive in front"
             )
+        nearest = np.float32(_NEAREST_M)
+        if not (self.depth >= nearest).all():
+            what = f"values below {_NEAREST_M:g} m, whose inverse overflows; depth is in metres"
+            _refuse(self.depth < nearest, "depth", what)
         low, high = self.color.min(), self.color.max()
         if not (low >= 0.0 and high < np.inf):
             _refuse(~np.isfinite(self.color), "color", "NaN or infinite values")

@@ -50,6 +50,9 @@ _BLADE_STEPS = 2048
 # An aperture image may lose this share of its light outside the unit disc (an antialiased rim), not more.
 _IMAGE_OUTSIDE = 0.01
 
+# Of the coefficients of the CoC, in px and px m: their products with inverse depths and scales fit float32.
+_LARGEST_COEFFICIENT = 1e15
+
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -423,9 +426,22 @@ class Lens:
         return self.focal_length_mm / diameter_mm if diameter_mm > 0.0 else math.inf
 
     def coc_coefficients(self, camera: Camera) -> CocCoefficients:
-        """The two numbers that kernels need; see the module's text."""
+        """The two numbers that kernels need; see the module's text.
+
+        Raises
+        ------
+        InputError
+            If one of them is so large that products with it overflow in float32.
+        """
         c1 = -camera.focal_px * self.aperture_radius_m
-        return CocCoefficients(c1, -c1 / self.focus_distance_m)
+        c0 = -c1 / self.focus_distance_m
+        if not (abs(c1) <= _LARGEST_COEFFICIENT and abs(c0) <= _LARGEST_COEFFICIENT):
+            raise InputError(
+                f"Lens of aperture_radius_m {self.aperture_radius_m:g} focused at {self.focus_distance_m:g} m blurs by "
+                f"up to {max(abs(c0), abs(c1)):.1g} px through a camera of {camera.focal_px:.3g} px focal length; use "
+                f"a smaller aperture (limit {_LARGEST_COEFFICIENT:g} px)."
+            )
+        return CocCoefficients(c1, c0)
 
     def coc_radius_px(self, camera: Camera, depth_m: ArrayLike) -> NDArray[np.float64]:
         """Signed CoC radius in pixels, negative nearer than focus.

@@ -46,9 +46,12 @@ __kernel void blur_fir(__global float *restrict out, const __global float *restr
  * and backwards over the same input; in float32 this form stays within 1e-6 of float64 up to sigma 200, where the
  * usual fourth-order direct form overflows. The backward sweep leaves the middle tap to the forward one.
  *
+ * The tails of a blurred image that is nowhere negative would still swing around 0 by what rounding and the fit leave,
+ * which shows where a lamp is a million times as bright: they are cut at 0.
+ *
  * A repeated edge pixel x0 makes the state before the first sample x0 / (1 - p), so edges are exact. */
 #ifndef IIR_SECTIONS
-#define IIR_SECTIONS 2
+#define IIR_SECTIONS 3
 #endif
 
 typedef struct {
@@ -60,6 +63,8 @@ typedef struct {
 typedef struct {
     float16 re[IIR_SECTIONS], im[IIR_SECTIONS];
 } IirState;
+
+static inline float16 not_negative(float16 v) { return v > 0.0f ? v : (float16)(0.0f); }
 
 static inline void iir_rest(IirState *s, const __global IirSection *k, float16 x)
 {
@@ -124,7 +129,7 @@ __kernel void blur_iir_columns(__global float *restrict out, const __global floa
     }
     iir_rest(&s, sections, load_quad(from + (height - 1) * stride));
     for (int y = height - 1; y >= 0; y--) {
-        store_quad(to + y * stride, load_quad(to + y * stride) + iir_output_past(&s, sections));
+        store_quad(to + y * stride, not_negative(load_quad(to + y * stride) + iir_output_past(&s, sections)));
         iir_advance(&s, sections, load_quad(from + y * stride));
     }
 }
@@ -168,7 +173,8 @@ __kernel void blur_iir_rows(__global float *restrict out, const __global float *
     for (int x = width - 1; x >= 0; x--) {
         /* Read all four before writing any: rows past the last one are the same memory. */
         float16 v = (float16)(load_pixel(to[0] + x * 4), load_pixel(to[1] + x * 4), load_pixel(to[2] + x * 4),
-                              load_pixel(to[3] + x * 4)) + iir_output_past(&s, sections);
+                              load_pixel(to[3] + x * 4));
+        v = not_negative(v + iir_output_past(&s, sections));
         store_pixel(to[0] + x * 4, v.s0123);
         store_pixel(to[1] + x * 4, v.s4567);
         store_pixel(to[2] + x * 4, v.s89ab);

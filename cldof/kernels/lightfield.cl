@@ -30,6 +30,10 @@
 #ifndef LIGHTFIELD_GLASS
 #define LIGHTFIELD_GLASS 0
 #endif
+/* 1: the frame is not opaque. */
+#ifndef LIGHTFIELD_VOID
+#define LIGHTFIELD_VOID 0
+#endif
 /* How a ray finds its colour: 0 that of the winner, 1 bilinear between the pixels of its surface, 2 a random pixel of
  * the surface within the ray's share of the lens. */
 #ifndef LIGHTFIELD_LOOKUP
@@ -842,7 +846,8 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
                left + (b << 8), top, shift_x, shift_y, seed + b)
 #if LIGHTFIELD_GLASS
             /* Rays that meet glass before what hides the rest: the panes over one another, then what is behind. A hole
-             * behind glass counts as far as the glass covers it. */
+             * behind glass counts as far as the glass covers it; or, if the frame lets the void through, as the void:
+             * behind the last peel there is no slot for it. */
             float4 panes[MAX_PLANES][16];
             uint2 pane_hits[MAX_PLANES][16];
             int has_pane[MAX_PLANES];
@@ -864,7 +869,7 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
                     last = pane_hits[next][i];
                     ray += (1.0f - ray.w) * panes[next][i];
                 }
-                weights[b + i] += is_hole ? weight * ray.w : weight;
+                weights[b + i] += !is_hole || (LIGHTFIELD_VOID && ray.w > 0.0f) ? weight : weight * ray.w;
                 if (!is_hole) ray += (1.0f - ray.w) * found[i];
                 total[b + i] += weight * ray;
             }

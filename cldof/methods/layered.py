@@ -51,12 +51,18 @@ _TILE = 64
 # value, since a Gaussian of sigma 5e-4 px keeps all but exp(-2e6) of a pixel in place.
 _NEGLIGIBLE_COC_PX = 1e-3
 
+# Layers blur by no more than this many times the frame's larger side, as CoC radius; the outermost ones take what is
+# blurred more. By then nothing is left of a frame but the mean of its edges.
+_WIDEST_SIDES = 4.0
+
 # A surface that slopes into a layer enters it this many sigma early, so that no seam opens between blurred layers.
 _SEAM_REACH = 2.0
 
 # Steps of the cascade when none is given: 1 px, or less until the side with more blur has so many layers, but no less
 # than 2^(-12/8) = 0.35 px. Fewer layers cost quality, finer steps are below what pixels can show.
 _STEPS_PER_OCTAVE = 8
+# Above this sigma (px) the variance of taps is an integral.
+_LARGE_SIGMA = 16.0
 _USUAL_LAYERS_A_SIDE = 8
 _FINEST_STEP = 12
 
@@ -176,7 +182,8 @@ class Layered:
         if not frame.is_opaque:
             farthest = 0.0  # the void is a surface at infinity
         near_px, far_px = max(0.0, -(c1 * nearest + c0)), max(0.0, c1 * farthest + c0)
-        stack = self._stack(near_px, far_px)
+        widest_px = _WIDEST_SIDES * max(frame.width, frame.height)
+        stack = self._stack(min(near_px, widest_px), min(far_px, widest_px))
         coc = layer_coc(stack)
         before = 0
         if both_sides:
@@ -282,7 +289,11 @@ def _side_coc(last: int, step: float) -> tuple[float, ...]:
 
 def _variance(sigma: float) -> float:
     """Variance that a step adds. Cut off and sampled taps have less than sigma^2, and the layers' CoC follow that."""
-    return gaussian.fir_variance(gaussian.fir_taps(sigma))
+    if sigma <= _LARGE_SIGMA:
+        return gaussian.fir_variance(gaussian.fir_taps(sigma))
+    end = (gaussian.fir_radius(sigma) + 0.5) / sigma  # 1e-6 from the sum over taps
+    density = math.exp(-0.5 * end * end) / math.sqrt(2.0 * math.pi)
+    return sigma * sigma * (1.0 - 2.0 * end * density / math.erf(end / math.sqrt(2.0)))
 
 
 def layer_coc(stack: LayerStack) -> NDArray[np.float64]:

@@ -47,6 +47,8 @@ _GLASS_PLANES = 2
 # A footprint reaches this far beyond half a pixel: steep edges, 4 px, and what rounding adds.
 _FOOTPRINT_PX = 6
 _MAX_LEVELS = 5
+# Below this CoC radius nothing moves by a step of the positions, 1/256 px, and all views are what a pinhole sees.
+_NEGLIGIBLE_COC_PX = 1e-3
 # Work-items that a CPU core should get, so that none waits for the last one.
 _ITEMS_PER_CORE = 2
 _WINNER_BYTES = 8
@@ -152,7 +154,7 @@ class LightField:
         if not frame.is_opaque:
             farthest = 0.0  # the void is a surface at infinity
         largest = max(abs(c1 * farthest + c0), abs(c1 * nearest + c0))
-        count = self.views if c1 != 0.0 else 1
+        count = self.views if largest >= _NEGLIGIBLE_COC_PX else 1
         # A ray's share of the CoC is pi C^2 / views; a level of the pyramid is as wide as a box of twice its texels.
         cell = math.sqrt(math.pi / count) / 2.0
         levels = 0
@@ -272,6 +274,7 @@ class _Builder:
         self.defines = (
             ("LIGHTFIELD_SUPPORT", _SUPPORTS.index(method.support)),
             ("LIGHTFIELD_GLASS", int(shape.has_glass)),
+            ("LIGHTFIELD_VOID", int(not shape.is_opaque)),
             ("LIGHTFIELD_LOOKUP", _LOOKUPS.index(method.lookup)),
             ("LIGHTFIELD_LEVELS", views.levels),
             ("LIGHTFIELD_PACKED", int(warp == "packed")),

@@ -61,6 +61,9 @@ _FITTED_SIGMA = 0.8587  # times 2**n, for more steps
 # A surface that slopes into a sub-image enters it this many sigma early, so that no seam opens.
 _SEAM_REACH = 2.0
 
+# Of the sum of a product and a number.
+_FLOAT32_ROUNDING = 4.0 * 2.0**-24
+
 # A step as a ramp: as steep as float32 tells depths apart.
 _STEP = 1e6
 
@@ -304,6 +307,9 @@ def matting_functions(
         if i != last:
             start, end = radius(i), radius(i + 1)
             ramp[row, 2:] = -a / (end - start), (end - b) / (end - start)
+            if i == 0:
+                # float32 may not take the plane in focus for less than whole: what is behind may be 1e6 times brighter.
+                ramp[row, 3] += _FLOAT32_ROUNDING * (abs(ramp[row, 3]) + abs(b / (end - start)))
     return Matting(ramp, seam)
 
 

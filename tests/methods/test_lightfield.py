@@ -46,6 +46,7 @@ def twin(frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:
         pitch=shape.pitch,
         guard=frame.guard_px,
         glass=frame.has_glass,
+        void=not frame.is_opaque,
         support=method.support,
         lookup=method.lookup,
         cos4=float(plan.params["lens"]["cos4"]),

@@ -188,7 +188,7 @@ def _look_up(
 
 def render(
     color: np.ndarray, inv_depth: np.ndarray, views: np.ndarray, c1: float, c0: float, *, pitch: int, guard: int,
-    glass: bool, support: str = "surface", lookup: str = "bilinear", cos4: float = 0.0,
+    glass: bool, void: bool = False, support: str = "surface", lookup: str = "bilinear", cos4: float = 0.0,
 ) -> np.ndarray:  # fmt: skip
     """A whole frame without mip levels; layers (M, H, W, 4) and (M, H, W) with -1 where nothing is."""
     planes = 3 if glass else 1
@@ -209,7 +209,8 @@ def render(
         found = _look_up(color, inv_depth, solid, view, c1, c0, pitch, guard, lookup, glass)
         image += np.where(there[..., None], (1.0 - image[..., 3:]) * found, 0.0)
         total += weight * image
-        seen += weight * np.where(there, 1.0, image[..., 3])
+        # Behind the last peel's glass no slot stands for the void.
+        seen += weight * np.where(there | (void & (image[..., 3] > 0)), 1.0, image[..., 3])
     inner = color[:, guard : guard + size[0], guard : guard + size[1]]
     pinhole = np.zeros((*size, 4))
     for layer in inner:

@@ -1,0 +1,125 @@
+"""One method on one device, rendered through the renderer with canaries around its buffers, and measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cldof import LayeredFrame, Lens, Renderer
+from cldof.host.device import DeviceInfo
+from cldof.methods import METHODS
+from tests.conftest import CanaryPool
+from tests.stability import Key, Measurements, driver_of
+
+# Beside the defaults of every registered method: the other engines, traversals and published forms.
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "layered iir": ("layered", {"engine": "iir"}),
+    "layered single": ("layered", {"cascade": False}),
+    "layered paper": ("layered", {"matting": "paper"}),
+    "lightfield atomic": ("lightfield", {"warp": "atomic"}),
+    "multiview peels": ("multiview", {"traversal": "peels"}),
+    "pyramid paper": (
+        "pyramid",
+        {"matting": "paper", "radius": "paper", "hidden": "interpolated", "normalise": False},
+    ),
+}
+SUBJECTS = {name: (name, {}) for name in METHODS} | VARIANTS
+
+_measurements = Measurements()
+
+
+class Subject:
+    """A method with options on a device.
+
+    Attributes
+    ----------
+    name : str
+        Of the method and variant.
+    method : str
+    options : dict
+    """
+
+    def __init__(self, name: str, info: DeviceInfo, family: str) -> None:
+        self.name, self.info, self._family = name, info, family
+        self.method, self.options = SUBJECTS[name]
+        self.renderer = Renderer(self.method, device=info.index, **self.options)
+        device = self.renderer.device
+        self._pool = CanaryPool(device.context, device.queue, shares_memory=device.pool.shares_memory)
+        device.pool = self._pool
+
+    @property
+    def is_gaussian(self) -> bool:
+        """Whether it simulates a Gaussian lens."""
+        return METHODS[self.method].simulated_aperture == "gaussian"
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether the device is for small cases only."""
+        return "llvmpipe" in self.info.name
+
+    def check_canaries(self) -> None:
+        """Fail if a kernel wrote outside its buffers."""
+        found = self._pool.trampled()
+        assert not found, f"{self.name}: a kernel wrote outside its buffers: {found}"
+
+    def render(self, frame: LayeredFrame, lens: Lens) -> np.ndarray:
+        """The image, float64; finite, or the test fails."""
+        image = self.renderer.render(frame, lens).image
+        bad = np.count_nonzero(~np.isfinite(image))
+        assert bad == 0, f"{self.name}: {bad} of {image.size} values are not finite"
+        return image.astype(np.float64)
+
+    def check(self, case: str, invariant: str, value: float, bound: float) -> None:
+        """Record a value that must not exceed its bound, and fail if it does."""
+        record(self._family, case, invariant, self.name, driver_of(self.info), value, bound)
+
+
+def record(family: str, case: str, invariant: str, subject: str, driver: str, value: float, bound: float) -> None:
+    """Record a value that must not exceed its bound, and fail if it does."""
+    value = float(value)
+    _measurements.add(Key(family, case, invariant, subject, driver), value, float(bound))
+    assert value <= bound, f"{subject}, {case}: {invariant} is {value:.4g}, more than {bound:.4g}"
+
+
+def pytest_sessionfinish() -> None:
+    """Write what was measured, if a file was asked for."""
+    path = Measurements.target()
+    if path is not None and _measurements.worst:
+        _measurements.save(path)
+
+
+@pytest.fixture(scope="module")
+def subjects(request: pytest.FixtureRequest, device_info: DeviceInfo) -> Iterator[Callable[[str], Subject]]:
+    """Subjects by name, made when they are first asked for and kept for a file of tests."""
+    made: dict[str, Subject] = {}
+    family = request.path.stem.removeprefix("test_")
+
+    def get(name: str) -> Subject:
+        if name not in made:
+            made[name] = Subject(name, device_info, family)
+        return made[name]
+
+    yield get
+    for subject in made.values():
+        subject.renderer.close()
+
+
+@pytest.fixture(params=sorted(SUBJECTS))
+def subject(request: pytest.FixtureRequest, subjects: Callable[[str], Subject]) -> Iterator[Subject]:
+    """Every method and variant in turn."""
+    one = subjects(request.param)
+    if one.is_slow and request.param in VARIANTS:
+        pytest.skip("variants are not run on llvmpipe, which takes 100 ns an item")
+    yield one
+    one.check_canaries()
+
+
+@pytest.fixture(params=sorted(METHODS))
+def method(request: pytest.FixtureRequest, subjects: Callable[[str], Subject]) -> Iterator[Subject]:
+    """Every method with its default options in turn."""
+    one = subjects(request.param)
+    yield one
+    one.check_canaries()
