@@ -55,9 +55,6 @@ _FEWEST_LAYERS = 5
 _CONE_WIDTH = 1.1
 # Rays per px^2 of the largest circle of confusion that a cell can see: more are not traced. Costs up to 0.2 dB.
 _RAYS_PER_PX2 = 1.0
-# Highlights that turn by less than this share of their own width over the lens's radius count as those of the lens
-# centre. What is left out is of second order in it: below 1 % of a highlight.
-_LEAST_TURN = 0.1
 # Pixels of the jitter pattern along x and y.
 _JITTER = 4
 
@@ -206,7 +203,7 @@ class Multiview:
         if self.traversal == "layers":
             most = min(most, max(_FEWEST_LAYERS, _LAYER_BYTES // (shape.height * shape.pitch * 16) - 2))
         layers = _layers(near_px, far_px, self.delta_px or _USUAL_DELTA_PX, most, lens.aperture)
-        if self.view_dependent and frame.lobe_turn_per_m * lens.aperture_radius_m > _LEAST_TURN:
+        if self.view_dependent and frame.is_glossy_through(lens):
             layers = layers._replace(eyes=min(self.eyes, self.rays))
         summary = {
             "method": self.name,
