@@ -1,4 +1,7 @@
-"""`python -m bench`: what `cldof bench` does, from a checkout; `python -m bench speed` times passes and blurs."""
+"""`python -m bench`: what `cldof bench` does, from a checkout.
+
+`python -m bench speed` times passes and blurs, `python -m bench auto` judges ``method="auto"``.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import sys
 from cldof.benchmark.command import add_arguments, bench
 from cldof.errors import CldofError
 
-from . import speed
+from . import auto, speed
 
 
 def main() -> int:
@@ -23,6 +26,15 @@ def main() -> int:
             parser.add_argument("--runs", type=int, default=30, help="frames to time (default 30)")
             arguments = parser.parse_args(sys.argv[2:])
             speed.report(arguments.device, max(arguments.runs, 3))
+            return 0
+        if sys.argv[1:2] == ["auto"]:
+            parser = argparse.ArgumentParser(prog="bench auto", description="How method='auto' keeps its budgets.")
+            parser.add_argument("--device", help="index, cpu, gpu or part of a name (as cldof render --device)")
+            parser.add_argument("--busy", action="store_true", help="processor time in place of the clock")
+            parser.add_argument("--scenes", nargs="+", default=auto.SCENES, help="of the built-in ones")
+            parser.add_argument("--output", metavar="FILE", help="keep every case as JSON")
+            arguments = parser.parse_args(sys.argv[2:])
+            auto.report(arguments.device, arguments.busy, tuple(arguments.scenes), arguments.output)
             return 0
         parser = argparse.ArgumentParser(prog="bench", description=__doc__)
         add_arguments(parser)

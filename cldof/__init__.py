@@ -5,6 +5,7 @@ from typing import Any
 
 from .camera import Camera
 from .errors import (
+    BudgetWarning,
     BuildError,
     CaptureError,
     CldofError,
@@ -23,6 +24,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Ambient",
     "Aperture",
+    "BudgetWarning",
     "BuildError",
     "Camera",
     "CaptureError",

@@ -16,6 +16,7 @@ import sys
 import textwrap
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib import metadata
@@ -47,6 +48,8 @@ _DEFAULT_SIZE = (1024, 1024)
 _DEFAULT_PEELS = 4
 # The reference by brute force (capture/accumulate.py) is asked for like a method; it needs no OpenCL.
 _ACCUMULATE = "accumulate"
+# Neither is the choice of one a method of its own.
+_AUTO = "auto"
 _DEFAULT_VIEWS = 64
 # An aperture of our choosing gives this largest CoC radius, as a share of the image height: clearly seen, not garish.
 # A sky may blur more, since it rarely shows, but not without bound, since it still costs.
@@ -139,6 +142,22 @@ def _parser() -> argparse.ArgumentParser:
     methods.set_defaults(run=_methods)
     from .benchmark.command import add_arguments
 
+    tune = commands.add_parser(
+        "tune",
+        help="measure what methods cost on a device, for --method auto",
+        description="Measure what settings cost on a device, a minute or two, and keep it for --method auto.",
+    )
+    tune.set_defaults(run=_tune)
+    tune.add_argument("frames", nargs="*", metavar="FRAME", help="frames saved as .npz, in place of built-in scenes")
+    tune.add_argument("--device", metavar="DEVICE", help="as for 'cldof render'")
+    tune.add_argument("--scenes", nargs="+", metavar="NAME", help="of the built-in ones (default all)")
+    tune.add_argument("--errors", action="store_true", help="measure errors too, some ten minutes more")
+    tune.add_argument("--rows", metavar="FILE", help="with --errors: also keep every measurement as JSON")
+    tune.add_argument(
+        "--busy", action="store_true", help="count processor time: for CPUs that have other work to do meanwhile"
+    )
+    tune.add_argument("--quiet", action="store_true", help="print errors only")
+
     bench = commands.add_parser(
         "bench",
         help="measure accuracy and time of every method on every device",
@@ -199,7 +218,9 @@ def _add_lens(parser: argparse.ArgumentParser) -> None:
 
 def _add_method(parser: argparse.ArgumentParser) -> None:
     how = parser.add_argument_group("how")
-    how.add_argument("--method", default="layered", help="a name from 'cldof methods' (default layered)")
+    how.add_argument("--method", default="layered", help="a name from 'cldof methods', or auto (default layered)")
+    how.add_argument("--max-error", metavar="ERROR", help="--method auto: PSNR to reach (35dB), or linear RMS (0.018)")
+    how.add_argument("--max-ms", type=_number, metavar="MS", help="--method auto: time for a frame")
     how.add_argument("--device", metavar="DEVICE", help="OpenCL device: index or part of a name from 'cldof devices'")
     how.add_argument(
         "--supersample", type=int, metavar="N", help="capture N times larger and scale down after the blur (default 1)"
@@ -215,11 +236,6 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--sigma-step", metavar="PX", help="short for --option sigma_step=PX")
     how.add_argument("--no-cascade", action="store_true", help="short for --option cascade=false")
     how.add_argument("--engine", metavar="NAME", help="short for --option engine=NAME")
-    how.add_argument(
-        "--no-view-dependent",
-        action="store_true",
-        help="shade what is glossy as the lens centre sees it; short for --option view_dependent=false",
-    )
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -248,6 +264,23 @@ def _sequence(arguments: argparse.Namespace) -> None:
     from .sequence_command import sequence
 
     sequence(arguments)
+
+
+def _tune(arguments: argparse.Namespace) -> None:
+    from .images import check_writable
+    from .tune import tune
+
+    if arguments.rows and not arguments.errors:
+        raise InputError("--rows keeps the measurements of --errors; give both.")
+    rows = check_writable(arguments.rows, ()) if arguments.rows else None
+    frames = [LayeredFrame.load(path) for path in arguments.frames]
+    watch = _Stopwatch(quiet=arguments.quiet)
+    with watch.step("tune") as progress:
+        curves, path = tune(
+            arguments.device, frames, arguments.errors, arguments.busy, arguments.scenes, rows, progress
+        )
+    if not arguments.quiet:
+        print(f"{path}\n  {curves.source['device']}, copy of 16 MB in {curves.source['copy_ms']:g} ms")
 
 
 def _bench(arguments: argparse.Namespace) -> None:
@@ -297,6 +330,10 @@ def _methods(arguments: argparse.Namespace) -> None:
         print(f"  Simulates a {shape} lens." if shape else "  Takes --aperture.")
         for option in options_of(method).values():
             show(f"{option.name}={option.kind}", str(option.default), option.text)
+    print(f"{_AUTO}: one of these, chosen for every frame by what it may err or take; see docs/auto.md")
+    print("  Takes --aperture.")
+    show("--max-error ERROR", "none", "PSNR to reach in dB (35dB), or linear RMS to stay below (0.018)")
+    show("--max-ms MS", "none", "time to stay below")
     print(f"{_ACCUMULATE}: the reference: many pinhole views through the lens, averaged; needs no OpenCL")
     print("  Takes --aperture.")
     show("--views N", str(_DEFAULT_VIEWS), "more views, less noise; the noise that is left is printed")
@@ -370,8 +407,10 @@ def _rendered(
         )
     capture = _load_shot if _is_saved_frame(arguments.scene) else _capture_shot
     shot = capture(arguments, settings, factor, watch)
-    with watch.step("render"):
+    with watch.step("render"), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         result = renderer.render(shot.frame, shot.lens)
+    shot.remarks.extend(str(warning.message).rstrip(".") for warning in caught)
 
     def pinhole() -> NDArray[np.float32]:
         sharp = shot.frame.pinhole_image()
@@ -380,6 +419,8 @@ def _rendered(
         return np.asarray(boxes.mean(axis=(1, 3), dtype=np.float64), np.float32) if factor > 1 else sharp
 
     asked = {"supersample": factor, **_plain(renderer.method)}
+    if result.choice is not None:
+        asked["choice"] = {**_plain(result.choice.to_dict()), "kernels_ms": sum(timing.ms for timing in result.timings)}
     device = str(renderer.device.info)
     return shot, _Picture(result.image, pinhole, asked, result.plan.summary, result.timings, device)
 
@@ -399,10 +440,7 @@ def _accumulated(
     peeler = stack.enter_context(DepthPeeler(camera.width, camera.height))
     preview, lens, remarks = _aimed(arguments, settings, peeler, scene, camera, watch)
     with watch.step(_ACCUMULATE) as progress:
-        reference = accumulate(
-            peeler, scene, camera, lens, views, jitter=jitter, progress=progress,
-            view_dependent=not arguments.no_view_dependent,
-        )  # fmt: skip
+        reference = accumulate(peeler, scene, camera, lens, views, jitter=jitter, progress=progress)
 
     def pinhole() -> NDArray[np.float32]:
         closed = dataclasses.replace(lens, aperture_radius_m=0.0)
@@ -412,7 +450,7 @@ def _accumulated(
     floor = facts["noise_floor_db"]
     if floor is not None:
         remarks.append(f"noise floor {floor:.1f} dB: the PSNR of this image against endlessly many views")
-    asked = {"views": views, "jitter": jitter, "seed": 0, "view_dependent": not arguments.no_view_dependent}
+    asked = {"views": views, "jitter": jitter, "seed": 0}
     shot = _Shot(preview, lens, camera, remarks, peeler.device)
     return shot, _Picture(reference.image, pinhole, asked, {"method": _ACCUMULATE, **facts}, [], None)
 
@@ -485,8 +523,17 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
     from .method_options import parse_options
     from .methods import METHODS
 
+    if arguments.method == _AUTO:
+        given = _flags(arguments, "option", "layers", "sigma_step", "no_cascade", "engine")
+        if given:
+            raise InputError(f"--method auto chooses the method's options; leave out {', '.join(given)}.")
+        if (arguments.max_error is None) == (arguments.max_ms is None):
+            raise InputError("--method auto needs --max-error (such as 35dB) or --max-ms (such as 40), one of both.")
+        return {"max_error": arguments.max_error, "max_ms": arguments.max_ms}
+    if given := _flags(arguments, "max_error", "max_ms"):
+        raise InputError(f"{', '.join(given)}: for --method auto only, not for {arguments.method!r}.")
     if arguments.method not in METHODS:
-        known = ", ".join([*METHODS, _ACCUMULATE])
+        known = ", ".join([*METHODS, _AUTO, _ACCUMULATE])
         raise InputError(f"Method {arguments.method!r} is unknown; choose one of {known}.")
     pairs = []
     for text in arguments.option:
@@ -501,14 +548,12 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
     ]
     if arguments.no_cascade:
         pairs.append(("cascade", "false"))
-    if arguments.no_view_dependent:
-        pairs.append(("view_dependent", "false"))
     return parse_options(arguments.method, pairs)
 
 
 def _aperture(arguments: argparse.Namespace) -> Aperture:
     """The shape of the aperture: the one asked for, or the one that the method simulates."""
-    if arguments.method != _ACCUMULATE:
+    if arguments.method not in (_ACCUMULATE, _AUTO):
         from .method_options import simulated_aperture
 
         simulated = simulated_aperture(arguments.method)
@@ -592,7 +637,7 @@ def _capture(
     factor: int,
     watch: _Stopwatch,
 ) -> LayeredFrame:
-    """Layers that serve all lenses: a guard band for the largest blur, surfaces where the preview asks for them."""
+    """Layers that serve all lenses, with a guard band for the largest blur."""
     needed = math.ceil(max(_largest_coc_px(lens, camera, preview) for lens in lenses))
     guard = min(needed, math.ceil(_GUARD_SHARE * max(camera.width, camera.height)))
     if guard < needed:
@@ -604,10 +649,7 @@ def _capture(
     widest = max(lenses, key=lambda lens: lens.aperture_radius_m)
     large = camera.supersampled(factor)
     with watch.step("capture") as progress:
-        surface = preview.is_glossy_through(widest)
-        return peeler.peel(
-            scene, large, layers=peels, lens=widest, guard_px=factor * guard, surface=surface, progress=progress
-        )
+        return peeler.peel(scene, large, layers=peels, lens=widest, guard_px=factor * guard, progress=progress)
 
 
 def _aimed(
@@ -620,16 +662,13 @@ def _aimed(
     whole: bool = False,
 ) -> tuple[LayeredFrame, Lens, list[str]]:
     """A first look at the scene, and the lens that follows from it; ``whole`` looks at every pixel."""
-    from .method_options import shades_surfaces
-
-    surface = arguments.method != _ACCUMULATE and shades_surfaces(arguments.method, settings.options)
     with watch.step("preview"):
         # On a pixel the depth has to be that pixel's own; for anything else a fraction of them is enough.
         shrink = 1 if whole or arguments.focus_at else _PREVIEW_SHRINK
         small = dataclasses.replace(
             camera, width=math.ceil(camera.width / shrink), height=math.ceil(camera.height / shrink)
         )
-        preview = peeler.peel(scene, small, layers=_PREVIEW_LAYERS, surface=surface)
+        preview = peeler.peel(scene, small, layers=_PREVIEW_LAYERS)
     return preview, *_choose_lens(arguments, settings, preview, camera, scene)
 
 
@@ -788,6 +827,14 @@ def _summarise(output: Path, facts: dict[str, Any], shot: _Shot, watch: _Stopwat
         print(f"  device  {facts['device']}")
     if shot.capture_device:
         print(f"  capture {shot.capture_device}")
+    choice = facts["settings"].get("choice")
+    if choice is not None:
+        options = ", ".join(f"{name}={value}" for name, value in choice["options"].items())
+        print(
+            f"  auto    {choice['method']}{f' ({options})' if options else ''}, {choice['reason']}: expected "
+            f"{choice['predicted_db']:.1f} dB (give or take {choice['uncertainty_db']:.1f}) and "
+            f"{choice['predicted_ms']:.1f} ms a frame; its kernels took {kernels_ms:.1f} ms"
+        )
     steps = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in watch.seconds.items())
     print(f"  times   {steps}" + (f" (kernels {kernels_ms:.1f} ms)" if facts["device"] else ""))
     for remark in shot.remarks:

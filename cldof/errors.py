@@ -6,6 +6,7 @@ paragraph and exit code 2.
 """
 
 __all__ = [
+    "BudgetWarning",
     "BuildError",
     "CaptureError",
     "CldofError",
@@ -47,3 +48,7 @@ class BuildError(DeviceError):
 
 class OutputError(CldofError):
     """A result cannot be written where it was asked for."""
+
+
+class BudgetWarning(UserWarning):
+    """No method is expected to keep the error or the time that was asked for; the nearest one was taken."""

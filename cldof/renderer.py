@@ -15,16 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .auto import Auto, Budget, Choice, Chooser, features, load_curves
+from .camera import Camera
 from .errors import CldofError, DeviceError, InputError
 from .frame import LayeredFrame
 from .host.buffers import BufferPool, HostInput
 from .host.device import Device
 from .host.launch import driver_errors
 from .host.passes import Buffer, FrameProgram, Pass, Role, read, write
-from .host.profile import PassTiming, pass_timings
+from .host.profile import PassTiming, copy_baseline, pass_timings
 from .host.scheduler import Batch, FrameRing, Submission, compile
 from .lens import Lens
-from .methods import FrameShape, make_method
+from .methods import FrameShape, Method, make_method
 from .planner import (
     MAX_CHANGE,
     FramePlan,
@@ -66,12 +68,15 @@ class Result:
     plan : FramePlan
         What was computed and what was left out; ``print(plan.explain())`` says it in words, ``plan.summary`` in plain
         numbers.
+    choice : Choice or None
+        With ``method="auto"``, what was chosen and expected.
     """
 
     image: NDArray[np.float32]
     timings: list[PassTiming]
     wall_ms: float
     plan: FramePlan
+    choice: Choice | None = None
 
 
 @dataclass
@@ -114,6 +119,52 @@ class _ComingStats:
         return self._stats
 
 
+class _Chosen:
+    """A choice of a frame that is on its way, and who learns from what it takes."""
+
+    def __init__(self, automatic: _Automatic, choice: Choice, feature: NDArray[np.float64], counts: bool) -> None:
+        self.choice = choice
+        self._automatic, self._feature, self._counts = automatic, feature, counts
+        automatic.under_way += 1
+
+    def took(self, ms: float) -> None:
+        self._automatic.under_way -= 1
+        if self._counts:
+            self._automatic.learn(self.choice, self._feature, ms)
+
+    def failed(self) -> None:
+        self._automatic.under_way -= 1
+
+
+class _Automatic:
+    """Methods by setting, and the chooser, which is made when the first frame comes."""
+
+    def __init__(self, budget: Budget, device: Device) -> None:
+        self._budget, self._device = budget, device
+        self._methods: dict[str, Method] = {}
+        self._chooser: Chooser | None = None
+        self._lock = threading.Lock()  # results may be asked for by other threads than frames
+        self.under_way = 0
+
+    def choose(self, stats: SceneStats, lens: Lens, camera: Camera) -> tuple[Method, Choice, NDArray[np.float64]]:
+        with self._lock:
+            if self._chooser is None:
+                info = self._device.info
+                curves = load_curves(info.name, info.driver_version)
+                self._chooser = Chooser(curves, self._budget, copy_baseline(self._device, runs=12).min_ms)
+            feature = features(stats, lens, camera)
+            choice = self._chooser.choose(feature)
+            setting = choice.setting
+            if str(setting) not in self._methods:
+                self._methods[str(setting)] = make_method(setting.method, **setting.options)
+            return self._methods[str(setting)], choice, feature
+
+    def learn(self, choice: Choice, feature: NDArray[np.float64], ms: float) -> None:
+        with self._lock:
+            if self._chooser is not None:
+                self._chooser.observe(choice, feature, ms)
+
+
 class PendingResult:
     """A frame on its way; made by :meth:`Renderer.render_async`."""
 
@@ -126,10 +177,11 @@ class PendingResult:
         started: float,
         profile: bool,
         report: Callable[[], None],
+        chosen: _Chosen | None = None,
     ) -> None:
         self._submission, self._event, self._image, self._plan = submission, event, image, plan
         self._report = report  # tells the renderer that the frame failed
-        self._started, self._profile = started, profile
+        self._started, self._profile, self._chosen = started, profile, chosen
         self._result: Result | None = None
 
     def done(self) -> bool:
@@ -151,10 +203,16 @@ class PendingResult:
                     self._event.wait()
             except DeviceError:
                 self._report()
+                if self._chosen is not None:
+                    self._chosen.failed()
                 raise
             wall_ms = (time.perf_counter() - self._started) * 1e3
             timings = pass_timings(self._submission) if self._profile else []
-            self._result = Result(self._image, timings, wall_ms, self._plan)
+            choice = None
+            if self._chosen is not None:
+                choice = self._chosen.choice
+                self._chosen.took(wall_ms)
+            self._result = Result(self._image, timings, wall_ms, self._plan, choice)
         return self._result
 
 
@@ -167,7 +225,8 @@ class Renderer:
     Parameters
     ----------
     method : str
-        Name of the method; see :data:`cldof.methods.METHODS`.
+        Name of the method; see :data:`cldof.methods.METHODS`. ``"auto"`` takes the options ``max_error`` or ``max_ms``
+        and chooses a method for every frame (:mod:`cldof.auto`, docs/auto.md).
     device : int or str, optional
         As :meth:`cldof.host.device.Device.open`: an index, ``"cpu"``, ``"gpu"`` or part of a name. None takes the
         environment's ``CLDOF_DEVICE``, else a GPU, else a CPU.
@@ -215,7 +274,9 @@ class Renderer:
     ) -> None:
         if not (isinstance(max_change, int | float) and 0.0 <= max_change < math.inf):
             raise InputError(f"max_change is {max_change!r}; it must be a number of at least 0, in linear units.")
-        self.method = make_method(method, **options)
+        self.method = _auto(options) if method == "auto" else make_method(method, **options)
+        if isinstance(self.method, Auto) and not planned:
+            raise InputError("method='auto' chooses by the planner's statistics; leave planned=True.")
         if frames_in_flight < 1:
             raise InputError(f"frames_in_flight is {frames_in_flight}; it must be at least 1.")
         if not (isinstance(supersample, int) and 1 <= supersample <= _MAX_SUPERSAMPLE):
@@ -227,12 +288,19 @@ class Renderer:
         else:
             self.device = Device.open(device, profiling=profile, out_of_order=out_of_order)
         self._slots = frames_in_flight
+        # A method may take in all samples of a pixel at once; otherwise they are rendered like pixels and averaged.
         self._supersample = supersample
         self._planned, self._max_change = planned, float(max_change)
+        if supersample > 1 and hasattr(self.method, "supersampled"):
+            self.method = self.method.supersampled(supersample)
+        self._taken_in = int(getattr(self.method, "supersample", 1))
+        if self._taken_in > 1:
+            self._supersample = 1
         self._lock = threading.Lock()
         self._rings: OrderedDict[Any, FrameRing] = OrderedDict()
         # Recent frames by identity; holding the frame keeps the identity from being used again.
         self._frames: OrderedDict[int, _DeviceFrame] = OrderedDict()
+        self._automatic = _Automatic(self.method.budget, self.device) if isinstance(self.method, Auto) else None
         self._closed = False
         self._has_failed = False
 
@@ -275,15 +343,26 @@ class Renderer:
         image = _output_array(out, (*self._image_size(shape), 4))
         with self._turn():
             held = self._upload(frame, shape)
-            plan = self._plan(held, lens)
-            ring = self._ring(shape, plan)
-            inputs, waits = self._inputs(held, ring.program)
+            method, choice, feature, is_alone = self.method, None, None, False
+            if self._automatic is not None and held.stats is not None:
+                is_alone = self._automatic.under_way == 0
+                method, choice, feature = self._automatic.choose(held.stats.wait(), lens, frame.camera)
+            assert not isinstance(method, Auto)
+            plan = self._plan(held, lens, method)
+            ring, is_new = self._ring(shape, plan, method)
+            inputs, waits = self._inputs(held, ring.program, method)
             submission = ring.submit(inputs, plan.params, waits)
             held.last_use = submission.event
             output = "image" if self._supersample == 1 else "resolved"
             download = self.device.pool.download(submission.batch.output(output), image, [submission.event])
             submission.batch.hold(download)
-        return PendingResult(submission, download, image, plan, started, self.device.is_profiling, self._note_failure)
+            chosen = None
+            if self._automatic is not None and choice is not None and feature is not None:
+                # The first frame of a kind builds what it needs; those that overlap with others wait for them.
+                chosen = _Chosen(self._automatic, choice, feature, is_alone and not is_new)
+        return PendingResult(
+            submission, download, image, plan, started, self.device.is_profiling, self._note_failure, chosen
+        )
 
     def stats(self, frame: LayeredFrame) -> SceneStats:
         """What the planner knows of a frame; uploads it, if need be, and waits for the answer.
@@ -329,17 +408,15 @@ class Renderer:
             if error is None:
                 raise
 
-    def _plan(self, held: _DeviceFrame, lens: Lens) -> FramePlan:
+    def _plan(self, held: _DeviceFrame, lens: Lens, method: Method) -> FramePlan:
         """What to compute; kept with the frame for the lenses last seen."""
-        key = (self.method, lens)
+        key = (method, lens)
         plan = held.plans.get(key)
         if plan is None:
             if held.stats is None:
-                plan = everything(self.method, held.frame, lens)
+                plan = everything(method, held.frame, lens)
             else:
-                plan = plan_frame(
-                    self.method, held.frame, lens, held.stats.wait(), self.device.traits, self._max_change
-                )
+                plan = plan_frame(method, held.frame, lens, held.stats.wait(), self.device.traits, self._max_change)
             while len(held.plans) >= _KEPT_PLANS:
                 held.plans.pop(next(iter(held.plans)))
             held.plans[key] = plan
@@ -379,7 +456,7 @@ class Renderer:
         self._has_failed = False
 
     def _image_size(self, shape: FrameShape) -> tuple[int, int]:
-        factor = self._supersample
+        factor = self._supersample * self._taken_in
         height, width = shape.output_size
         if height % factor or width % factor:
             raise InputError(
@@ -413,7 +490,7 @@ class Renderer:
         self._frames[key] = held
         return held
 
-    def _inputs(self, held: _DeviceFrame, program: FrameProgram) -> tuple[dict[str, Any], list[Any]]:
+    def _inputs(self, held: _DeviceFrame, program: FrameProgram, method: Method) -> tuple[dict[str, Any], list[Any]]:
         """What the program reads of the frame, uploaded when it is first asked for, and what to wait for."""
         buffers, waits = {}, [held.ready]
         for name in (name for name, buffer in program.buffers.items() if buffer.role is Role.INPUT):
@@ -423,7 +500,7 @@ class Renderer:
             if name not in held.arrays:
                 if name not in held.frame.inputs:
                     raise InputError(
-                        f"Method {self.method.name!r} needs the frame's {name} buffer; capture with surface=True."
+                        f"Method {method.name!r} needs the frame's {name} buffer; capture with surface=True."
                     )
                 held.arrays[name] = self.device.pool.to_device(held.frame.inputs[name], f"upload {name}")
             buffers[name] = held.arrays[name].buffer
@@ -445,19 +522,30 @@ class Renderer:
                 old.preparation.close()
         return preparation
 
-    def _ring(self, shape: FrameShape, plan: FramePlan) -> FrameRing:
-        key = (self.method, shape, plan.structure)
+    def _ring(self, shape: FrameShape, plan: FramePlan, method: Method) -> tuple[FrameRing, bool]:
+        """Programs and buffers for frames of a kind, and whether they were made just now."""
+        key = (method, shape, plan.structure)
         ring = self._rings.get(key)
+        is_new = ring is None
         if ring is None:
             while len(self._rings) >= _KEPT_PROGRAMS:
                 self._rings.popitem(last=False)[1].close()
-            program = planned_program(self.method, shape, plan, self.device.traits)
+            program = planned_program(method, shape, plan, self.device.traits)
             if self._supersample > 1:
                 program = _resolved(program, self._image_size(shape), self._supersample)
             ring = FrameRing(program, self.device, self._slots)
             self._rings[key] = ring
         self._rings.move_to_end(key)
-        return ring
+        return ring, is_new
+
+
+def _auto(options: dict[str, Any]) -> Auto:
+    unknown = sorted(set(options) - {"max_error", "max_ms"})
+    if unknown:
+        raise InputError(f"Method 'auto' has no option {unknown[0]!r}; its options are: max_error, max_ms.")
+    made = Auto(**options)
+    made.budget  # noqa: B018  refuses what makes no sense before a device is opened
+    return made
 
 
 def frame_stats(device: Device, frame: LayeredFrame) -> SceneStats:

@@ -25,7 +25,8 @@ ALLOWED = {
     "host": {"host", "errors", "files", "kernels"},
     "methods": DATA | {"methods", "host", "kernels"},
     "planner": DATA | {"planner", "methods", "host"},
-    "renderer": DATA | {"renderer", "planner", "methods", "host"},
+    "auto": DATA | {"auto", "planner"},
+    "renderer": DATA | {"renderer", "auto", "planner", "methods", "host"},
 }
 # Packages that only some rooms may import, however deep inside a function.
 FOREIGN = {

@@ -6,9 +6,12 @@
  * 16 pixels of a run move by the same whole number of pixels: the way of 16 rays through a layer is one contiguous,
  * unaligned load. Gathers, which CPUs are slow at, do not occur.
  *
- * Layer s holds the C in [low + s * delta, low + (s + 1) * delta) and is met at the middle of that. Layers are
+ * Layer s holds the C between its bounds and is met in its middle, or at the mean C of what it holds. Layers are
  * float[height][pitch][4], premultiplied; alpha is how much of the pixel, or of the cone around it, the layer blocks.
- * Cells are MULTIVIEW_CELL x MULTIVIEW_CELL pixels; bit s of a cell's mask says that layer s has something there. */
+ * Cells are MULTIVIEW_CELL x MULTIVIEW_CELL pixels; bit s of a cell's mask says that layer s has something there.
+ *
+ * Peels may have MULTIVIEW_SCALE times the pixels of the image along x and y. What is called fine below has the size of
+ * the peels, everything else that of the image; C is in pixels of the image. */
 
 #include "common.clh"
 
@@ -22,11 +25,12 @@
 #define MULTIVIEW_CLOSED 1e-3f
 /* Steps in px from one pixel to the next that belong to one surface. */
 #define MULTIVIEW_CONNECTED 2.0f
+/* How far a surface goes on behind a slot, in fine pixels: to the next pixel, and one more for windows of several. */
+#define MULTIVIEW_GOES_ON (float)(MULTIVIEW_SCALE == 1 ? 1 : MULTIVIEW_SCALE + 1)
 /* Below this share of rays that met something known, a pixel is what a pinhole sees. */
 #define MULTIVIEW_LEAST 1e-4f
-/* Pixels that a cone may reach to either side, a multiple of 4, and pixels of a row that an item of the filter makes. */
-#define MULTIVIEW_HALO 16
-#define MULTIVIEW_RUN 64
+/* Light above this, blurred by a good deal, takes more rays: it shows them. */
+#define MULTIVIEW_BRIGHT 1.5f
 
 /* 1: the frame's image is not opaque. Layer `layers` of the stack then holds, in alpha, where the view goes past the
  * scene. */
@@ -47,9 +51,32 @@
 #define MULTIVIEW_PARTS 0
 #endif
 
+/* Pixels of the peels for one of the image, along x and y. */
+#ifndef MULTIVIEW_SCALE
+#define MULTIVIEW_SCALE 1
+#endif
+/* Fine pixels that a cone may reach to either side, a multiple of 4, and pixels of a row that an item of the filter
+ * makes. */
+#define MULTIVIEW_HALO (16 * MULTIVIEW_SCALE)
+#define MULTIVIEW_RUN 64
+
 typedef struct {
     int width, height, pitch, peels, layers, cells_x, cells_y;
 } MultiviewSize;
+
+/* How C is cut: layers of `fine` around the focus as far as `turn` to either side, then layers of `coarse`. */
+typedef struct {
+    float fine, coarse, turn, front;
+} MultiviewSteps;
+
+/* Layers between the near end of the first layer and C, with a fraction. */
+static inline float16 layer_at(float16 c, MultiviewSteps steps)
+{
+    float16 away = c < 0.0f ? -c : c;
+    float16 near = away < steps.turn ? away : (float16)(steps.turn);
+    float16 n = near / steps.fine + (away - near) / steps.coarse;
+    return (c < 0.0f ? -n : n) + (steps.front + 0.5f);
+}
 
 static inline float16 coc_of(float16 w, float c1, float c0)
 {
@@ -71,7 +98,7 @@ static inline float16 step_of(float16 c, float16 a, float16 b)
  * source  takes the place of the fixed 10 % overlap of layers, section 4.2
  * reads   inv_depth  float[peels][height][pitch]  1/m
  * writes  extent     float[peels][height][pitch]  px, C of the far end; -MULTIVIEW_NOWHERE where nothing is
- * range   3-D, one item per 16 pixels of a row of a peel, any local size */
+ * range   3-D, one item per 16 fine pixels of a row of a peel, any local size */
 __kernel void multiview_extent(__global float *restrict extent, const __global float *restrict inv_depth,
                                MultiviewSize size, float c1, float c0)
 {
@@ -87,7 +114,7 @@ __kernel void multiview_extent(__global float *restrict extent, const __global f
                                         : (float16)(c.s12345678, c.s9abc, c.sde, c.sf, none.s0);
     float16 above = y > 0 ? coc_of(load_quad(inv - size.pitch), c1, c0) : none;
     float16 below = y + 1 < size.height ? coc_of(load_quad(inv + size.pitch), c1, c0) : none;
-    float16 end = c + (step_of(c, left, right) + step_of(c, above, below));
+    float16 end = c + MULTIVIEW_GOES_ON * (step_of(c, left, right) + step_of(c, above, below));
     store_quad(extent + at, w < 0.0f ? -none : end);
 }
 
@@ -98,19 +125,20 @@ __kernel void multiview_extent(__global float *restrict extent, const __global f
  * writes  nbuffer    uint[0][cells_y][cells_x]    bit s: layer s
  * range   2-D, one item per cell, any local size */
 __kernel void multiview_cells(__global uint *restrict nbuffer, const __global float *restrict inv_depth,
-                              const __global float *restrict extent, MultiviewSize size, float c1, float c0, float low,
-                              float delta)
+                              const __global float *restrict extent, MultiviewSize size, MultiviewSteps steps,
+                              float c1, float c0)
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= size.cells_x || cy >= size.cells_y) return;
     const int y_end = (cy + 1) * MULTIVIEW_CELL < size.height ? (cy + 1) * MULTIVIEW_CELL : size.height;
-    const float scale = 1.0f / delta, last = (float)(size.layers - 1);
+    const float last = (float)(size.layers - 1);
     uint16 mask = (uint16)(0u);
     for (int m = 0; m < size.peels; m++)
         for (int y = cy * MULTIVIEW_CELL; y < y_end; y++) {
             const size_t at = ((size_t)m * size.height + y) * size.pitch + MULTIVIEW_CELL * cx;
             float16 w = load_quad(inv_depth + at);
-            float16 from = (w * c1 + c0 - low) * scale - 1e-3f, to = (load_quad(extent + at) - low) * scale + 1e-3f;
+            float16 from = layer_at(w * c1 + c0, steps) - 1e-3f;
+            float16 to = layer_at(load_quad(extent + at), steps) + 1e-3f;
             from = from < 0.0f ? (float16)(0.0f) : from;
             from = from > last ? (float16)(last) : from;
             to = to > last ? (float16)(last) : to;
@@ -141,42 +169,137 @@ __kernel void multiview_nbuffer(__global uint *nbuffer, MultiviewSize size, int 
     nbuffer[level * plane + cy * size.cells_x + cx] = mask;
 }
 
+/* What is in the fine cells from (x0, y0) to (x1, y1), cut by the frame: four squares of the N-buffer, or more where the
+ * frame cuts the window into a long one. */
+static inline uint masks_in(const __global uint *nbuffer, MultiviewSize fine, int levels, int x0, int y0, int x1, int y1)
+{
+    const size_t plane = (size_t)fine.cells_x * fine.cells_y;
+    x0 = clamp_index(x0, fine.cells_x - 1), x1 = clamp_index(x1, fine.cells_x - 1);
+    y0 = clamp_index(y0, fine.cells_y - 1), y1 = clamp_index(y1, fine.cells_y - 1);
+    const int across = x1 - x0 + 1, down = y1 - y0 + 1, side = across < down ? across : down;
+    int n = 0;
+    while (n + 1 < levels && 2 << n <= side) n++;
+    const int last_x = x1 + 1 - (1 << n), last_y = y1 + 1 - (1 << n);
+    uint mask = 0u;
+    for (int y = y0;; y = y + (1 << n) < last_y ? y + (1 << n) : last_y) {
+        for (int x = x0;; x = x + (1 << n) < last_x ? x + (1 << n) : last_x) {
+            mask |= nbuffer[n * plane + y * fine.cells_x + x];
+            if (x == last_x) break;
+        }
+        if (y == last_y) return mask;
+    }
+}
+
+/* multiview_wanted: which layers any ray may look at in a cell. The others need not be filled there, not even with
+ * nothing: in a frame that is mostly in focus that is most of the work.
+ * reads   nbuffer  uint[levels][fine cells_y][cells_x]
+ *         reach    int[layers]   fine cells that rays and cones of a layer may move to either side
+ * writes  wanted   uint[cells_y][cells_x]  bit s: layer s
+ * range   2-D, one item per cell, any local size */
+__kernel void multiview_wanted(__global uint *restrict wanted, const __global uint *restrict nbuffer,
+                               const __global int *restrict reach, MultiviewSize fine, MultiviewSize size, int levels,
+                               int cull)
+{
+    const int cx = get_global_id(0), cy = get_global_id(1);
+    if (cx >= size.cells_x || cy >= size.cells_y) return;
+    uint list = 0u;
+    for (int s = 0; s < size.layers; s++) {
+        /* A pixel within reach of something looks as far again; runs share the lists of their cells. */
+        const int r = 2 * reach[s] + MULTIVIEW_STRIDE * MULTIVIEW_SCALE;
+        const int x = cx * MULTIVIEW_SCALE, y = cy * MULTIVIEW_SCALE, last = MULTIVIEW_SCALE - 1;
+        list |= masks_in(nbuffer, fine, levels, x - r, y - r, x + last + r, y + last + r) & 1u << s;
+    }
+    wanted[cy * size.cells_x + cx] = cull ? list : ~0u;
+}
+
+/* multiview_centres: the C at which rays meet each layer: the mean over what it holds, bright things first, since their
+ * discs show it most.
+ * reads   moments  float4[layers][fine cells_y][cells_x]  as multiview_split writes them
+ *         nbuffer  uint[0][fine cells_y][cells_x]
+ *         nominal  float[layers]  px, for layers with nothing of their own
+ * writes  coc      float[layers]  px
+ * range   1-D, one item per layer, any local size */
+__kernel void multiview_centres(__global float *restrict coc, const __global float4 *restrict moments,
+                                const __global uint *restrict nbuffer, const __global float *restrict nominal,
+                                MultiviewSize fine, float least)
+{
+    const int s = get_global_id(0), cells = fine.cells_x * fine.cells_y;
+    if (s >= fine.layers) return;
+    float total = 0.0f, weight = 0.0f;
+    for (int i = 0; i < cells; i++)
+        if (nbuffer[i] >> s & 1u) {
+            total += moments[s * cells + i].x;
+            weight += moments[s * cells + i].y;
+        }
+    const float away = nominal[s] < 0.0f ? -nominal[s] : nominal[s];
+    coc[s] = away >= least && weight > 0.0f ? total / weight : nominal[s];
+}
+
+/* multiview_shifts: how many pixels each ray has moved at each layer.
+ * reads   points  float2[rays]    on the lens, right and down, in units of its radius
+ *         coc     float[layers]   px
+ *         scale   float[layers]   of points; below 1 where the width of a layer's windows is part of its blur
+ * writes  shifts  int2[rays][layers]  right and down
+ * range   2-D, one item per layer and ray, any local size */
+__kernel void multiview_shifts(__global int2 *restrict shifts, const __global float2 *restrict points,
+                               const __global float *restrict coc, const __global float *restrict scale, int layers,
+                               int rays)
+{
+    const int s = get_global_id(0), i = get_global_id(1);
+    if (s >= layers || i >= rays) return;
+    shifts[i * layers + s] = convert_int2_rtn(points[i] * (scale[s] * coc[s]) + 0.5f);
+}
+
+/* multiview_bright: which layers have light in a cell that a disc of blur shows; the first level of an N-buffer.
+ * reads   moments  float4[layers][fine cells_y][cells_x]
+ *         nbuffer  uint[0][fine cells_y][cells_x]
+ * writes  bright   uint[0][fine cells_y][cells_x]
+ * range   2-D, one item per fine cell, any local size */
+__kernel void multiview_bright(__global uint *restrict bright, const __global float4 *restrict moments,
+                               const __global uint *restrict nbuffer, MultiviewSize fine)
+{
+    const int cx = get_global_id(0), cy = get_global_id(1), at = cy * fine.cells_x + cx;
+    if (cx >= fine.cells_x || cy >= fine.cells_y) return;
+    uint mask = 0u;
+    for (uint left = nbuffer[at]; left != 0u; left &= left - 1u) {
+        int s = 0;
+        while (!(left >> s & 1u)) s++;
+        if (moments[s * fine.cells_x * fine.cells_y + at].z > MULTIVIEW_BRIGHT) mask |= 1u << s;
+    }
+    bright[at] = mask;
+}
+
 /* multiview_lists: the layers that any ray through a cell can meet, and how many rays that takes.
- * reads   nbuffer  uint[levels][cells_y][cells_x]
- *         reach    int[layers]   cells that rays and cones of a layer may move to either side
- *         needs    int[layers]   set of rays for the blur of a layer
+ * reads   nbuffer  uint[levels][fine cells_y][cells_x]
+ *         bright   uint[levels][fine cells_y][cells_x]
+ *         coc      float[layers]  px
+ *         reach    int[layers]    fine cells that rays and cones of a layer may move to either side
+ *         moves    float[layers]  how far the farthest ray moves per px of C; where that comes to less than `still`, one
+ *                                 ray says all
+ *         needs    int2[layers]   set of rays for the blur of a layer, and for bright light in it
  * writes  lists    uint[cells_y][cells_x]  bit s: layer s
  *         sets     int[cells_y][cells_x]   set of rays
  * range   2-D, one item per cell, any local size */
 __kernel void multiview_lists(__global uint *restrict lists, __global int *restrict sets,
-                              const __global uint *restrict nbuffer, const __global int *restrict reach,
-                              const __global int *restrict needs, MultiviewSize size, int levels, int cull)
+                              const __global uint *restrict nbuffer, const __global uint *restrict bright,
+                              const __global float *restrict coc, const __global int *restrict reach,
+                              const __global float *restrict moves, const __global int2 *restrict needs,
+                              MultiviewSize fine, MultiviewSize size, int levels, int cull, float still)
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= size.cells_x || cy >= size.cells_y) return;
-    const size_t plane = (size_t)size.cells_x * size.cells_y;
     uint list = 0u;
     int set = 0;
     for (int s = 0; s < size.layers; s++) {
-        const int r = reach[s];
-        const int x0 = cx > r ? cx - r : 0, x1 = clamp_index(cx + r, size.cells_x - 1);
-        const int y0 = cy > r ? cy - r : 0, y1 = clamp_index(cy + r, size.cells_y - 1);
-        const int across = x1 - x0 + 1, down = y1 - y0 + 1, side = across < down ? across : down;
-        int n = 0;
-        while (n + 1 < levels && 2 << n <= side) n++;
-        /* Four squares, or more where the window is cut by the frame into a long one. */
-        const int last_x = x1 + 1 - (1 << n), last_y = y1 + 1 - (1 << n);
-        uint mask = 0u;
-        for (int y = y0;; y = y + (1 << n) < last_y ? y + (1 << n) : last_y) {
-            for (int x = x0;; x = x + (1 << n) < last_x ? x + (1 << n) : last_x) {
-                mask |= nbuffer[n * plane + y * size.cells_x + x];
-                if (x == last_x) break;
-            }
-            if (y == last_y) break;
-        }
-        if (!(mask >> s & 1u)) continue;
+        const int x0 = cx * MULTIVIEW_SCALE - reach[s], x1 = (cx + 1) * MULTIVIEW_SCALE - 1 + reach[s];
+        const int y0 = cy * MULTIVIEW_SCALE - reach[s], y1 = (cy + 1) * MULTIVIEW_SCALE - 1 + reach[s];
+        if (!(masks_in(nbuffer, fine, levels, x0, y0, x1, y1) >> s & 1u)) continue;
         list |= 1u << s;
-        set = set > needs[s] ? set : needs[s];
+        const float move = (coc[s] < 0.0f ? -coc[s] : coc[s]) * moves[s];
+        if (move < still) continue;
+        const int is_bright = masks_in(bright, fine, levels, x0, y0, x1, y1) >> s & 1u;
+        const int need = is_bright ? needs[s].y : needs[s].x;
+        set = set > need ? set : need;
     }
     lists[cy * size.cells_x + cx] = cull ? list : ~0u >> (MULTIVIEW_MAX_LAYERS - size.layers);
     sets[cy * size.cells_x + cx] = set;
@@ -184,53 +307,77 @@ __kernel void multiview_lists(__global uint *restrict lists, __global int *restr
 
 /* multiview_split: one layer, the nearest slots inside it; several peels of glass one over the other.
  * source  eq. 4; exact where the paper's single pass may lose fragments of triangles that cross a bound
- * reads   color      float[peels][height][width][4]
- *         inv_depth  float[peels][height][pitch]  1/m
- *         extent     float[peels][height][pitch]  px
- *         nbuffer    uint[0][cells_y][cells_x]
- * writes  layers     float[slot][height][pitch][4]
- * range   2-D, one item per cell, any local size */
-__kernel void multiview_split(__global float *restrict layers, const __global float *restrict color,
-                              const __global float *restrict inv_depth, const __global float *restrict extent,
-                              const __global uint *restrict nbuffer, MultiviewSize size, float c1, float c0, float from,
-                              float to, int layer, int slot)
+ * reads   color      float[peels][fine height][width][4]
+ *         inv_depth  float[peels][fine height][pitch]  1/m
+ *         extent     float[peels][fine height][pitch]  px
+ *         nbuffer    uint[0][fine cells_y][cells_x]
+ *         wanted     uint[cells_y][cells_x]
+ * writes  layers     float[slot][fine height][pitch][4]  not with MULTIVIEW_PEELED
+ *         moments    float4[layers][fine cells_y][cells_x]  sums of weighted C and of weights, most light; where the
+ *                    layer has something
+ * range   2-D, one item per fine cell, any local size */
+__kernel void multiview_split(
+#if !MULTIVIEW_PEELED
+                              __global float *restrict layers,
+#endif
+                              __global float4 *moments, const __global float *restrict color, const __global float *restrict inv_depth,
+                              const __global float *restrict extent, const __global uint *restrict nbuffer,
+                              const __global uint *restrict wanted, MultiviewSize fine, int wanted_x, float c1,
+                              float c0, float from, float to, int layer, int slot)
 {
     const int cx = get_global_id(0), cy = get_global_id(1), x = MULTIVIEW_CELL * cx;
-    if (cx >= size.cells_x || cy >= size.cells_y) return;
-    const int y_end = (cy + 1) * MULTIVIEW_CELL < size.height ? (cy + 1) * MULTIVIEW_CELL : size.height;
-    const int peels = nbuffer[cy * size.cells_x + cx] >> layer & 1u ? size.peels : 0;
+    if (cx >= fine.cells_x || cy >= fine.cells_y) return;
+    if (!(wanted[cy / MULTIVIEW_SCALE * wanted_x + cx / MULTIVIEW_SCALE] >> layer & 1u)) return;
+    const int y_end = (cy + 1) * MULTIVIEW_CELL < fine.height ? (cy + 1) * MULTIVIEW_CELL : fine.height;
+    const int peels = nbuffer[cy * fine.cells_x + cx] >> layer & 1u ? fine.peels : 0;
+    float4 total = (float4)(0.0f), weights = (float4)(0.0f), most = (float4)(0.0f);
     for (int y = cy * MULTIVIEW_CELL; y < y_end; y++) {
         float16 quad[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
         for (int m = 0; m < peels; m++) {
-            const size_t row = (size_t)m * size.height + y;
-            float16 c = load_quad(inv_depth + row * size.pitch + x) * c1 + c0;
-            float16 end = load_quad(extent + row * size.pitch + x);
+            const size_t row = (size_t)m * fine.height + y;
+            float16 c = load_quad(inv_depth + row * fine.pitch + x) * c1 + c0;
+            float16 end = load_quad(extent + row * fine.pitch + x);
             float16 in = c < to && end >= from ? (float16)(1.0f) : (float16)(0.0f);
             if (sum16(in) == 0.0f) continue;
             float16 own = c >= from ? in : (float16)(0.0f);
-            const __global float *rgba = color + (row * size.width + x) * 4;
+            const __global float *rgba = color + (row * fine.width + x) * 4;
             const float4 ins[4] = {in.s0123, in.s4567, in.s89ab, in.scdef};
             const float4 owns[4] = {own.s0123, own.s4567, own.s89ab, own.scdef};
+            const float4 cs[4] = {c.s0123, c.s4567, c.s89ab, c.scdef};
 #pragma unroll
             for (int q = 0; q < 4; q++) {
-                const int valid = size.width - x - 4 * q;
+                const int valid = fine.width - x - 4 * q;
                 if (valid <= 0) continue;
                 float16 v = valid >= 4 ? load_quad(rgba + 16 * q) : load_quad_part(rgba + 16 * q, valid);
+                float4 seen = 1.0f - quad[q].s37bf, light = v.s048c;
+                light = light < v.s159d ? v.s159d : light;
+                light = light < v.s26ae ? v.s26ae : light;
+                float4 pull = (light * light + 0.01f * v.s37bf) * seen * owns[q];
                 /* An opaque slot may be met twice, glass must not. */
                 float4 weight = v.s37bf >= MULTIVIEW_OPAQUE ? ins[q] : owns[q];
-                quad[q] += v * spread((1.0f - quad[q].s37bf) * weight);
+                quad[q] += v * spread(seen * weight);
+                total += owns[q] > 0.0f ? pull * cs[q] : (float4)(0.0f);
+                weights += pull;
+                light *= seen * owns[q];
+                most = most < light ? light : most;
             }
         }
-        __global float *out = layers + (((size_t)slot * size.height + y) * size.pitch + x) * 4;
+#if !MULTIVIEW_PEELED
+        __global float *out = layers + (((size_t)slot * fine.height + y) * fine.pitch + x) * 4;
 #pragma unroll
         for (int q = 0; q < 4; q++) store_quad(out + 16 * q, quad[q]);
+#endif
     }
+    float2 most2 = most.lo < most.hi ? most.hi : most.lo;
+    moments[((size_t)layer * fine.cells_y + cy) * fine.cells_x + cx] =
+        (float4)((total.x + total.y) + (total.z + total.w), (weights.x + weights.y) + (weights.z + weights.w),
+                 most2.x < most2.y ? most2.y : most2.x, 0.0f);
 }
 
 /* multiview_past: where the void is seen past everything in a frame that is not opaque: in columns of peels that let
  * light through, and behind those that end before the last peel, since nothing else can be there.
- * reads   color   float[peels][height][width][4]
- * writes  layers  float[slot][height][pitch][4]  (0, 0, 0, 1) where the void is known to be, else 0
+ * reads   color   float[peels][fine height][width][4]
+ * writes  layers  float[slot][height][pitch][4]  (0, 0, 0, 1) where the void is known to be, else 0; or a part of that
  * range   2-D, one item per row: (1, height), any local size */
 __kernel void multiview_past(__global float *restrict layers, const __global float *restrict color, MultiviewSize size,
                              int slot)
@@ -238,68 +385,91 @@ __kernel void multiview_past(__global float *restrict layers, const __global flo
     const int y = get_global_id(1);
     if (y >= size.height) return;
     __global float *out = layers + ((size_t)slot * size.height + y) * size.pitch * 4;
+    const size_t width = (size_t)size.width * MULTIVIEW_SCALE, height = (size_t)size.height * MULTIVIEW_SCALE;
     for (int x = 0; x < size.pitch; x++) {
-        float through = x < size.width ? 1.0f : 0.0f, alpha = 1.0f;
-        for (int m = 0; m < (x < size.width ? size.peels : 0); m++) {
-            alpha = color[(((size_t)m * size.height + y) * size.width + x) * 4 + 3];
-            through *= 1.0f - alpha;
+        float past = 0.0f;
+        for (int i = 0; i < (x < size.width ? MULTIVIEW_SCALE * MULTIVIEW_SCALE : 0); i++) {
+            const size_t from_x = x * MULTIVIEW_SCALE + i % MULTIVIEW_SCALE;
+            const size_t from_y = y * MULTIVIEW_SCALE + i / MULTIVIEW_SCALE;
+            float through = 1.0f, alpha = 1.0f;
+            for (int m = 0; m < size.peels; m++) {
+                alpha = color[((m * height + from_y) * width + from_x) * 4 + 3];
+                through *= 1.0f - alpha;
+            }
+            past += through > MULTIVIEW_CLOSED || alpha == 0.0f ? 1.0f : 0.0f;
         }
-        const int is_void = through > MULTIVIEW_CLOSED || alpha == 0.0f;
-        store_pixel(out + 4 * x, (float4)(0.0f, 0.0f, 0.0f, is_void ? 1.0f : 0.0f));
+        past *= 1.0f / (MULTIVIEW_SCALE * MULTIVIEW_SCALE);
+        store_pixel(out + 4 * x, (float4)(0.0f, 0.0f, 0.0f, past));
     }
 }
 
 /* multiview_cone: one layer as cones see it: the mean over a square window as wide as the cone is there.
  * source  section 4.4. All cones of a layer have the same width there, so that full-size means take the place of mip
  *         levels: no steps between levels, and still one look-up a ray
- * reads   image    float[height][pitch][4]
- *         nbuffer  uint[0][cells_y][cells_x]
+ * reads   image    float[fine height][pitch][4]
+ *         nbuffer  uint[0][fine cells_y][cells_x]
+ *         wanted   uint[cells_y][cells_x]
  * writes  layers   float[slot][height][pitch][4]
- * scalars window of 2 * radius + 1 whole pixels and `edge` (0 to 1) of one more at either side
+ * scalars window of `taps` whole fine pixels from `first` fine pixels right of (and below) the pixel's first one on, and
+ *         `edge` (0 to 1) of one more at either side
  * range   2-D, one item per MULTIVIEW_RUN x MULTIVIEW_CELL pixels, any local size */
 __kernel void multiview_cone(__global float *restrict layers, const __global float *restrict image,
-                             const __global uint *restrict nbuffer, MultiviewSize size, int layer, int slot, int radius,
-                             float edge)
+                             const __global uint *restrict nbuffer, const __global uint *restrict wanted,
+                             MultiviewSize fine, MultiviewSize size, int layer, int slot, int first, int taps, float edge)
 {
     const int x0 = MULTIVIEW_RUN * (int)get_global_id(0), cy = get_global_id(1);
     if (x0 >= size.pitch || cy >= size.cells_y) return;
     const int y_end = (cy + 1) * MULTIVIEW_CELL < size.height ? (cy + 1) * MULTIVIEW_CELL : size.height;
     const int x1 = x0 + MULTIVIEW_RUN < size.pitch ? x0 + MULTIVIEW_RUN : size.pitch;
-    const float scale = 1.0f / ((float)(2 * radius + 1) + 2.0f * edge);
-    uint around = 0u;
-    for (int j = cy - 1; j <= cy + 1; j++)
-        for (int i = x0 / MULTIVIEW_CELL - 1; i <= (x0 + MULTIVIEW_RUN) / MULTIVIEW_CELL; i++)
-            if (i >= 0 && j >= 0 && i < size.cells_x && j < size.cells_y) around |= nbuffer[j * size.cells_x + i];
+    const float scale = 1.0f / ((float)taps + 2.0f * edge);
+    uint wants = 0u, around = 0u;
+    for (int i = x0 / MULTIVIEW_CELL; i < (x0 + MULTIVIEW_RUN) / MULTIVIEW_CELL && i < size.cells_x; i++)
+        wants |= wanted[cy * size.cells_x + i];
+    if (!(wants >> layer & 1u)) return;
+    const int margin = MULTIVIEW_HALO / MULTIVIEW_CELL, cell_y = cy * MULTIVIEW_SCALE;
+    const int cell_x = x0 / MULTIVIEW_CELL * MULTIVIEW_SCALE;
+    for (int j = cell_y - margin; j < cell_y + MULTIVIEW_SCALE + margin; j++)
+        for (int i = cell_x - margin; i < cell_x + MULTIVIEW_SCALE * MULTIVIEW_RUN / MULTIVIEW_CELL + margin; i++)
+            if (i >= 0 && j >= 0 && i < fine.cells_x && j < fine.cells_y) around |= nbuffer[j * fine.cells_x + i];
     const int is_empty = !(around >> layer & 1u);
-    float line[(MULTIVIEW_RUN + 2 * MULTIVIEW_HALO) * 4];
+    float line[(MULTIVIEW_SCALE * MULTIVIEW_RUN + 2 * MULTIVIEW_HALO) * 4];
     for (int y = cy * MULTIVIEW_CELL; y < y_end; y++) {
         __global float *out = layers + ((size_t)slot * size.height + y) * size.pitch * 4;
         if (is_empty) {
             for (int x = x0; x < x1; x += 4) store_quad(out + x * 4, (float16)(0.0f));
             continue;
         }
-        for (int j = 0; j < MULTIVIEW_RUN + 2 * MULTIVIEW_HALO; j += 4) {
-            const int x = x0 - MULTIVIEW_HALO + j;
+        const int start = x0 * MULTIVIEW_SCALE - MULTIVIEW_HALO;
+        for (int j = 0; j < MULTIVIEW_SCALE * MULTIVIEW_RUN + 2 * MULTIVIEW_HALO; j += 4) {
+            const int x = start + j;
             float16 sum = (float16)(0.0f);
-            if (x >= 0 && x < size.pitch)
-                for (int t = -radius - 1; t <= radius + 1; t++) {
-                    const int from = clamp_index(y + t, size.height - 1);
-                    const float weight = t < -radius || t > radius ? edge : 1.0f;
-                    sum += (weight * scale) * load_quad(image + ((size_t)from * size.pitch + x) * 4);
+            if (x >= 0 && x < fine.pitch)
+                for (int t = -1; t <= taps; t++) {
+                    const int from = clamp_index(y * MULTIVIEW_SCALE + first + t, fine.height - 1);
+                    const float weight = t < 0 || t == taps ? edge : 1.0f;
+                    sum += (weight * scale) * load_quad(image + ((size_t)from * fine.pitch + x) * 4);
                 }
             *(float16_unaligned *)(line + 4 * j) = sum;
         }
         /* Beyond the frame its edge goes on. */
-        for (int j = 0; j < MULTIVIEW_RUN + 2 * MULTIVIEW_HALO; j++) {
-            const int x = x0 - MULTIVIEW_HALO + j, inside = clamp_index(x, size.width - 1);
+        for (int j = 0; j < MULTIVIEW_SCALE * MULTIVIEW_RUN + 2 * MULTIVIEW_HALO; j++) {
+            const int x = start + j, inside = clamp_index(x, fine.width - 1);
             if (x != inside)
-                for (int c = 0; c < 4; c++) line[4 * j + c] = line[4 * (inside - x0 + MULTIVIEW_HALO) + c];
+                for (int c = 0; c < 4; c++) line[4 * j + c] = line[4 * (inside - start) + c];
         }
         for (int x = x0; x < x1; x += 4) {
-            const float *at = line + 4 * (MULTIVIEW_HALO + x - x0);
-            float16 sum = edge * (*(const float16_unaligned *)(at - 4 * (radius + 1)) +
-                                  *(const float16_unaligned *)(at + 4 * (radius + 1)));
-            for (int t = -radius; t <= radius; t++) sum += *(const float16_unaligned *)(at + 4 * t);
+            const float *at = line + 4 * (MULTIVIEW_HALO + (x - x0) * MULTIVIEW_SCALE + first);
+#if MULTIVIEW_SCALE == 1
+            float16 sum = edge * (*(const float16_unaligned *)(at - 4) + *(const float16_unaligned *)(at + 4 * taps));
+            for (int t = 0; t < taps; t++) sum += *(const float16_unaligned *)(at + 4 * t);
+#else
+            float4 p[4];
+            for (int j = 0; j < 4; j++, at += 4 * MULTIVIEW_SCALE) {
+                p[j] = edge * (*(const float4_unaligned *)(at - 4) + *(const float4_unaligned *)(at + 4 * taps));
+                for (int t = 0; t < taps; t++) p[j] += *(const float4_unaligned *)(at + 4 * t);
+            }
+            float16 sum = (float16)(p[0], p[1], p[2], p[3]);
+#endif
             store_quad(out + x * 4, sum * scale);
         }
     }
@@ -372,9 +542,12 @@ static inline void peeled_quads(float16 quad[4], const __global float *color, co
 /* What a lens of radius 0 sees: where every ray of a pixel is lost. */
 static inline float4 pinhole(const __global float *color, MultiviewSize size, int x, int y)
 {
+    const size_t width = (size_t)size.width * MULTIVIEW_SCALE, height = (size_t)size.height * MULTIVIEW_SCALE;
+    const int middle = MULTIVIEW_SCALE / 2;
     float4 v = (float4)(0.0f);
     for (int m = size.peels - 1; m >= 0; m--) {
-        float4 front = load_pixel(color + (((size_t)m * size.height + y) * size.width + x) * 4);
+        const size_t row = m * height + y * MULTIVIEW_SCALE + middle;
+        float4 front = load_pixel(color + (row * width + x * MULTIVIEW_SCALE + middle) * 4);
         v = front + (1.0f - front.w) * v;
     }
     return v;
@@ -417,7 +590,7 @@ __kernel void multiview_finish(__global float *restrict image, const __global fl
 /* multiview_trace: all rays of 16 pixels, front to back through the layers of their cells.
  * source  sections 4.3 and 4.4: v1 * c1 + (1 - v1) * c2
  * reads   layers    float[layers (+ 1)][height][pitch][4]
- *         color     float[peels][height][width][4]
+ *         color     float[peels][fine height][width][4]
  *         inv_depth, extent, bounds  as multiview_split has them; with MULTIVIEW_PEELED only, in place of layers
  *         lists     uint[cells_y][cells_x]
  *         sets      int[cells_y][cells_x]

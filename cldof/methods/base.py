@@ -67,7 +67,7 @@ def row_pitch(width: int) -> int:
     return pitch + 16 if pitch % 256 == 0 else pitch
 
 
-def struct_scalar(dtype: np.dtype[Any], *values: int) -> np.generic:
+def struct_scalar(dtype: np.dtype[Any], *values: float) -> np.generic:
     """A struct argument of a kernel, field by field."""
     record: Any = np.array(values, dtype)
     scalar: np.generic = record[()]

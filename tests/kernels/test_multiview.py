@@ -6,8 +6,8 @@ import pytest
 from cldof import Lens
 from cldof.host.device import Device
 from cldof.host.passes import Buffer, FrameProgram, Pass, Role, read, read_write, write
-from cldof.methods.base import row_pitch
-from cldof.methods.multiview import _SIZE
+from cldof.methods.base import row_pitch, struct_scalar
+from cldof.methods.multiview import _SIZE, _STEPS
 from tests.frames import noise_frame
 from tests.oracles import multiview as oracle
 from tests.running import padded, run_pass, run_program
@@ -22,16 +22,22 @@ def size_of(width: int, height: int, peels: int = 1, layers: int = 32) -> np.gen
 def _lists(cells: tuple[int, int], levels: int, reach: int) -> FrameProgram:
     """From an N-buffer ``first`` to ``lists``."""
     nbytes = 4 * cells[0] * cells[1]
-    constant = {"reach": np.full(32, reach, np.int32), "needs": np.zeros(32, np.int32)}
+    constant = {
+        "bright": np.zeros(levels * cells[0] * cells[1], np.uint32),
+        "coc": np.zeros(32, np.float32),
+        "reach": np.full(32, reach, np.int32),
+        "moves": np.zeros(32, np.float32),
+        "needs": np.zeros((32, 2), np.int32),
+    }
     buffers = [
         Buffer("first", levels * nbytes, Role.INPUT),
         Buffer("lists", nbytes, Role.OUTPUT),
         Buffer("sets", nbytes),
         *(Buffer(name, data.nbytes, Role.CONSTANT, data) for name, data in constant.items()),
     ]
-    inputs = [read(name) for name in ("first", "reach", "needs")]
+    inputs = [read("first"), *(read(name) for name in constant)]
     size = size_of(16 * cells[0], 16 * cells[1])
-    args = (write("lists"), write("sets"), *inputs, size, np.int32(levels), np.int32(1))
+    args = (write("lists"), write("sets"), *inputs, size, size, np.int32(levels), np.int32(1), np.float32(0.499))
     return FrameProgram.of(buffers, [Pass("multiview", "multiview_lists", args, cells)])
 
 
@@ -43,9 +49,11 @@ def test_nbuffer_is_the_union_over_squares(device: Device, cells: tuple[int, int
     levels = max(cells).bit_length()
     width, height = 16 * across, 16 * down
     size, pitch = size_of(width, height), row_pitch(width)
-    inverse = padded((layer + 0.5).astype(np.float32).repeat(16, 0).repeat(16, 1), pitch, -1.0)
+    inverse = padded(layer.astype(np.float32).repeat(16, 0).repeat(16, 1), pitch, -1.0)
     nbytes = levels * across * down * 4
-    lens = (np.float32(1.0), np.float32(0.0), np.float32(0.0), np.float32(1.0))
+    # Layer k from C = k - 0.5 on: rounded ones of 1 px.
+    steps = struct_scalar(_STEPS, 1.0, 1.0, 0.5, 0.0)
+    lens = (steps, np.float32(1.0), np.float32(0.0))
     buffers = [Buffer("inv_depth", inverse.nbytes, Role.INPUT), Buffer("nbuffer", nbytes, Role.OUTPUT)]
     args = (write("nbuffer"), read("inv_depth"), read("inv_depth"), size, *lens)
     passes = [Pass("multiview", "multiview_cells", args, cells)]
@@ -77,30 +85,37 @@ def test_lists_hold_what_is_within_reach(device: Device, cells: tuple[int, int],
 
 
 @pytest.mark.parametrize("size", [(1, 1), (37, 21), (131, 67)])
-@pytest.mark.parametrize("window", [(0, 0.3), (2, 0.75), (13, 1.0)])
-def test_cone_meets_the_oracle(device: Device, size: tuple[int, int], window: tuple[int, float]) -> None:
+@pytest.mark.parametrize("window", [(0, 1, 0.3), (-2, 5, 0.75), (-13, 27, 1.0)])
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_cone_meets_the_oracle(
+    device: Device, size: tuple[int, int], window: tuple[int, int, float], scale: int
+) -> None:
     width, height = size
-    image = np.random.default_rng(2).random((height, width, 4), np.float32)
-    radius, edge = window
-    pitch = row_pitch(width)
+    image = np.random.default_rng(2).random((height * scale, width * scale, 4), np.float32)
+    pitch, fine_pitch = row_pitch(width), row_pitch(width * scale)
     cells = np.full((-(-height // 16), -(-width // 16)), 4, np.uint32)
+    fine_cells = np.full((-(-height * scale // 16), -(-width * scale // 16)), 4, np.uint32)
     out = run_pass(
         device,
         "multiview",
         "multiview_cone",
         [
-            padded(image, pitch, 0.0),
+            padded(image, fine_pitch, 0.0),
+            fine_cells,
             cells,
+            size_of(width * scale, height * scale),
             size_of(width, height),
             np.int32(2),
             np.int32(0),
-            np.int32(radius),
-            np.float32(edge),
+            np.int32(window[0]),
+            np.int32(window[1]),
+            np.float32(window[2]),
         ],
         (height, pitch, 4),
         (-(-pitch // 64), -(-height // 16)),
+        defines=(("MULTIVIEW_SCALE", scale),),
     )
-    assert_close(out[:, :width], oracle.cone(image.astype(np.float64), radius, edge), "multiview_cone")
+    assert_close(out[:, :width], oracle.cone(image.astype(np.float64), *window, scale), "multiview_cone")
 
 
 def test_extent_meets_the_oracle(device: Device) -> None:

@@ -13,7 +13,7 @@ from cldof.host.device import Device
 from cldof.host.passes import FrameProgram
 from cldof.lens import GaussianAperture, PolygonAperture
 from cldof.methods import FrameShape
-from cldof.methods.multiview import MAX_LAYERS, Multiview, cones, ray_sets
+from cldof.methods.multiview import _CENTRED_PX, MAX_LAYERS, Multiview, cones, ray_sets, shift_scales
 from tests.frames import noise_frame, plane_frame
 from tests.oracles import multiview as oracle
 from tests.running import inverse_depth, run_program
@@ -21,7 +21,7 @@ from tests.tolerances import assert_close
 
 
 def render(device: Device, frame: LayeredFrame, lens: Lens, one_ray: np.ndarray | None = None, **options) -> np.ndarray:
-    """Render; with ``one_ray``, (K, 2), every pixel sends this ray alone."""
+    """Render; with ``one_ray``, (2,) right and down per px of C, every pixel sends this ray alone."""
     method = Multiview(**options)
     shape = FrameShape.of(frame)
     plan = method.plan(frame, lens)
@@ -29,32 +29,44 @@ def render(device: Device, frame: LayeredFrame, lens: Lens, one_ray: np.ndarray 
     if one_ray is not None:
         buffers = dict(program.buffers)
         for name, data in (
-            ("shifts", np.repeat(one_ray[None], 1, 0)),
-            ("ray_sets0", np.repeat([[0, 1]], 16, 0)),
+            ("points", np.broadcast_to(np.float32(one_ray), (plan_rays(program), 2))),
+            ("ray_sets0", np.repeat(np.int32([[0, 1]]), 16, 0)),
         ):
-            data = np.ascontiguousarray(data, np.int32)
+            data = np.ascontiguousarray(data)
             buffers[name] = replace(buffers[name], nbytes=data.nbytes, data=data)
         program = FrameProgram(buffers, program.passes)
     inputs = {"color": frame.color, "inv_depth": inverse_depth(device, frame)}
-    return run_program(device, program, inputs, dict(plan.params), "image", (*shape.output_size, 4))
+    size = tuple(side // method.supersample for side in shape.output_size)
+    return run_program(device, program, inputs, dict(plan.params), "image", (*size, 4))
+
+
+def plan_rays(program: FrameProgram) -> int:
+    return program.buffers["points"].nbytes // 8
 
 
 def twin(device: Device, frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:
     method = Multiview(adaptive=False, **options)
     layers = method.plan(frame, lens).structure
     rays = ray_sets(method, layers)
-    first, count = rays.ranges[0, -1]
-    windows = cones(layers, method.rays) if method.has_cones else [None] * layers.total
+    first, count = next(each for each in rays.ranges[0] if each[1] == method.rays)
+    factor = method.supersample
+    windows = [None] * layers.total
+    if factor > 1 or method.has_cones:
+        windows = cones(layers, method.rays if method.has_cones else 0, factor, method.antialias)
     inverse = inverse_depth(device, frame)[..., : frame.width].astype(np.float64)
     return oracle.render(
         frame.color,
         inverse,
-        *lens.coc_coefficients(frame.camera),
+        *(value / factor for value in lens.coc_coefficients(frame.camera)),
         layers.bounds.astype(np.float64),
+        layers.coc,
         windows,
-        rays.shifts[first : first + count],
+        rays.points[first : first + count].astype(np.float64),
+        shift_scales(layers, factor, method.antialias),
         opaque=frame.is_opaque,
-        guard=frame.guard_px,
+        guard=frame.guard_px // factor,
+        scale=factor,
+        least=_CENTRED_PX if method.is_centred else math.inf,
     )
 
 
@@ -73,7 +85,9 @@ def test_meets_the_oracle(device: Device, size: tuple[int, int], opaque: bool, c
     )
 
 
-@pytest.mark.parametrize("options", [{"delta_px": 2.0}, {"layers": 5}, {"rays": 1}, {"rays": 3}, {"seed": 7}])
+@pytest.mark.parametrize(
+    "options", [{"delta_px": 2.0}, {"layers": 5}, {"rays": 1}, {"rays": 3}, {"seed": 7}, {"centred": True}]
+)
 def test_options_meet_the_oracle(device: Device, options: dict) -> None:
     frame = noise_frame(90, 70, guard_px=9)
     lens = Lens(10.0 / frame.camera.focal_px, 2.0)
@@ -90,6 +104,87 @@ def test_apertures_meet_the_oracle(device: Device, aperture: object) -> None:
     lens = Lens(10.0 / frame.camera.focal_px, 2.0, aperture=aperture)
     image = render(device, frame, lens, adaptive=False, rays=9)
     assert_close(image, twin(device, frame, lens, rays=9), "multiview")
+
+
+@pytest.mark.parametrize(("supersample", "antialias"), [(2, True), (3, True), (3, False)])
+@pytest.mark.parametrize("opaque", [True, False], ids=["opaque", "void"])
+@pytest.mark.parametrize("size", [(2, 1), (25, 14), (44, 22)])
+def test_supersampled_peels_meet_the_oracle(
+    device: Device, supersample: int, antialias: bool, opaque: bool, size: tuple[int, int]
+) -> None:
+    guard = 2 * supersample
+    frame = noise_frame(size[0] * supersample, size[1] * supersample, opaque=opaque, guard_px=guard)
+    lens = Lens(8.0 * supersample / frame.camera.focal_px, 1.7)
+    options = {"supersample": supersample, "antialias": antialias, "rays": 9}
+    image = render(device, frame, lens, adaptive=False, **options)
+    assert image.shape == (size[1], size[0], 4)
+    assert_close(image, twin(device, frame, lens, **options), "multiview")
+    np.testing.assert_array_equal(render(device, frame, lens, adaptive=False, cull=False, **options), image)
+
+
+def test_supersampled_peels_in_focus_are_box_filtered_or_their_middles(device: Device) -> None:
+    image = np.random.default_rng(1).random((60, 90, 4), np.float32)
+    image[..., 3] = 1.0
+    frame = plane_frame(image, 2.0)
+    lens = Lens(9.0 / frame.camera.focal_px, 2.0)
+    smooth = render(device, frame, lens, supersample=3)
+    np.testing.assert_allclose(smooth, image.reshape(20, 3, 30, 3, 4).mean((1, 3)), atol=1e-6)
+    sharp = render(device, frame, lens, supersample=3, antialias=False)
+    np.testing.assert_array_equal(sharp, image[1::3, 1::3])
+
+
+@pytest.mark.parametrize("blur_px", [0.3, 0.6, 1.0, 2.0, 3.5, 8.0])
+def test_supersampled_blur_is_as_wide_as_the_lens_says(device: Device, blur_px: float) -> None:
+    """Down to a fraction of a pixel, which single samples cannot show: the width of a line's blur."""
+    total = second = 0.0
+    for place in range(93, 96):
+        image = np.zeros((45, 189, 4), np.float32)
+        image[..., 3] = 1.0
+        image[:, place, :3] = 1.0
+        frame = plane_frame(image, 8.0)
+        lens = Lens(3 * blur_px / (1.0 / 2.0 - 1.0 / 8.0) / frame.camera.focal_px, 2.0)
+        light = render(device, frame, lens, supersample=3, rays=256)[7, :, 0].astype(float)
+        away = np.arange(63) - (place - 1) / 3.0
+        total += light.sum()
+        second += (light * away**2).sum()
+    assert total == pytest.approx(1.0, rel=0.01)
+    # A disc, a line of a third and the box of the pixel, at all places in the pixel.
+    assert second / total == pytest.approx(blur_px**2 / 4.0 + 1.0 / 108.0 + 1.0 / 12.0, rel=0.12)
+
+
+def test_bright_light_takes_more_rays(device: Device) -> None:
+    """Four times as many where a lamp's disc may reach, and only there."""
+    image = np.random.default_rng(0).random((96, 400, 4), np.float32)
+    image[..., 3] = 1.0
+    image[40:43, 40:43, :3] = 50.0
+    frame = plane_frame(image, 9.0)
+    lens = Lens(20.0 / frame.camera.focal_px, 2.0)
+    options = {"cone": False, "adaptive": False}
+    boosted = render(device, frame, lens, rays=16, **options)
+    plain = render(device, frame, lens, rays=16, highlights=False, **options)
+    many = render(device, frame, lens, rays=64, highlights=False, **options)
+    np.testing.assert_array_equal(boosted[16:64, 16:64], many[16:64, 16:64])
+    np.testing.assert_array_equal(boosted[:, 100:], plain[:, 100:])
+    assert np.abs(many - plain)[:, 100:].max() > 0.0
+
+
+def test_layers_are_met_where_their_content_is(device: Device) -> None:
+    """A wall anywhere inside a thick layer is blurred as the lens says, not as the middle of the layer would be."""
+    for depth in (3.0, 3.3, 3.7, 4.2, 5.0):
+        image = np.zeros((121, 121, 4), np.float32)
+        image[..., 3] = 1.0
+        image[60, 60, :3] = 1.0
+        image = np.concatenate([image, image])  # the lower half stands at infinity and stretches the layers
+        z = np.full((242, 121), depth, np.float32)
+        z[121:] = np.inf
+        frame = LayeredFrame(image, z, Camera(121, 242, 40.0))
+        lens = Lens(50.0 / frame.camera.focal_px, 2.0)
+        light = render(device, frame, lens, delta_px=5.0, rays=256, cone=False, centred=True)[:121, :, 0].astype(
+            np.float64
+        )
+        y, x = np.mgrid[-60:61, -60:61]
+        radius = math.sqrt(2.0 * (light * (x**2 + y**2)).sum() / light.sum())
+        assert radius == pytest.approx(abs(float(lens.coc_radius_px(frame.camera, depth))), rel=0.04)
 
 
 @pytest.mark.parametrize("layers", [1, 2, 6])
@@ -117,7 +212,7 @@ def test_culling_changes_no_bit(device: Device, jitter: bool, opaque: bool) -> N
 def test_peels_and_layers_agree(device: Device, size: tuple[int, int], jitter: bool, opaque: bool) -> None:
     frame = noise_frame(*size, opaque=opaque, seed=size[0])
     lens = Lens(8.0 / frame.camera.focal_px, 1.7)
-    options = {"rays": 7, "cone": False, "jitter": jitter}
+    options = {"rays": 7, "cone": False, "jitter": jitter, "centred": opaque}
     layers, peels = (render(device, frame, lens, traversal=kind, **options) for kind in ("layers", "peels"))
     np.testing.assert_allclose(peels, layers, atol=2e-6)
 
@@ -156,7 +251,7 @@ def test_rays_hit_what_dense_marching_hits(device: Device) -> None:
     inner = (slice(reach, -reach), slice(reach, -reach))
     agree, explained = [], []
     for point in lens.aperture.samples(16, seed=2):
-        image = render(device, frame, lens, one_ray=np.floor(point * layers.coc[:, None] + 0.5), cone=False)
+        image = render(device, frame, lens, one_ray=point, cone=False)
         found = image[..., 0].astype(int)
         peel, row, column = np.unravel_index(found, frame.depth.shape)
         coc = columns.near[peel, row, column]
@@ -348,6 +443,9 @@ def test_an_enormous_aperture_is_rendered(device: Device) -> None:
         ({"seed": -1}, "seed is -1"),
         ({"traversal": "texels"}, "choose one of layers, peels"),
         ({"traversal": "peels", "cone": True}, "cone=True needs"),
+        ({"traversal": "peels", "supersample": 2}, "supersample needs"),
+        ({"supersample": 9}, "from 1 to 8"),
+        ({"supersample": 2, "antialias": False}, "odd number"),
     ],
 )
 def test_bad_options_are_refused(options: dict, message: str) -> None:

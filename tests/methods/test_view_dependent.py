@@ -57,7 +57,7 @@ def test_in_focus_the_mean_over_the_eyes(device_info: DeviceInfo, lighting: Ligh
 
 def test_eyes_fill_the_lens() -> None:
 
-    method = Multiview(rays=64, eyes=16)
+    method = Multiview(rays=64, eyes=16, highlights=False)
     rays = ray_sets(method, _layers(10.0, 10.0, 0.5, 32, LENS.aperture)._replace(eyes=16))
     points = LENS.aperture.samples(64, 0)
     assert rays.ranges.shape[0] == 16 and (rays.ranges[..., 1] >= 1).all()

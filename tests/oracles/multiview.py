@@ -1,5 +1,6 @@
 """The multiview method in float64, from Lee, Eisemann & Seidel 2009 and the choices in docs/methods/multiview.md."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +15,8 @@ class Slots(NamedTuple):
     far: np.ndarray
 
 
-def slots(inverse_depth: np.ndarray, c1: float, c0: float) -> Slots:
-    """Near end of each slot, and how far its surface goes on behind it on the way to the next pixels.
+def slots(inverse_depth: np.ndarray, c1: float, c0: float, scale: int = 1) -> Slots:
+    """Near end of each slot, and how far its surface goes on behind it: to the next pixel or beyond.
 
     ``inverse_depth`` is negative where nothing is.
     """
@@ -31,7 +32,7 @@ def slots(inverse_depth: np.ndarray, c1: float, c0: float) -> Slots:
             step[tuple(edge)] = np.inf
             steps.append(step)
         least = np.minimum(*steps)
-        far += np.where(least > 2.0, 0.0, least)
+        far += (1 if scale == 1 else scale + 1) * np.where(least > 2.0, 0.0, least)
     return Slots(np.where(there, near, np.inf), np.where(there, far, -np.inf))
 
 
@@ -46,23 +47,51 @@ def split(color: np.ndarray, columns: Slots, bounds: np.ndarray) -> np.ndarray:
     return layers
 
 
-def cone(image: np.ndarray, radius: int, edge: float) -> np.ndarray:
-    """Mean over a square window of ``2 * radius + 1 + 2 * edge`` pixels; beyond the image its edge goes on."""
-    taps = np.array([edge, *[1.0] * (2 * radius + 1), edge])
-    taps /= taps.sum()
+def centres(color: np.ndarray, columns: Slots, bounds: np.ndarray, nominal: np.ndarray, least: float) -> np.ndarray:
+    """C at which each layer is met: the mean of what begins and is seen in it, weighted by the square of its light."""
+    coc = nominal.copy()
+    for layer, (low, high) in enumerate(pairwise(bounds)):
+        covered = np.zeros(color.shape[1:3])
+        total = weight = 0.0
+        for rgba, near, far in zip(color, columns.near, columns.far, strict=True):
+            begins = (near < high) & (near >= low)
+            reaches = (near < high) & (far >= low)
+            pull = (rgba[..., :3].max(axis=-1) ** 2 + 0.01 * rgba[..., 3]) * (1.0 - covered) * begins
+            total += (pull * np.where(begins, near, 0.0)).sum()
+            weight += pull.sum()
+            is_in = np.where(rgba[..., 3] >= 0.998, reaches, begins)
+            covered += rgba[..., 3] * (1.0 - covered) * is_in
+        if weight > 0.0 and abs(nominal[layer]) >= least:
+            coc[layer] = total / weight
+    return coc
+
+
+def shifts(points: np.ndarray, coc: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Right and down in px, (rays, K, 2)."""
+    return np.floor(points[:, None] * (scales * coc)[None, :, None] + 0.5).astype(int)
+
+
+def cone(image: np.ndarray, first: int, taps: int, edge: float, scale: int = 1) -> np.ndarray:
+    """Means over square windows; beyond the image its edge goes on.
+
+    Windows have ``taps`` whole pixels from ``first`` on, counted from every ``scale``-th pixel, and ``edge`` of one
+    more at either side.
+    """
+    weights = np.array([edge, *[1.0] * taps, edge])
+    weights /= weights.sum()
     for axis in (0, 1):
-        pad = [(0, 0)] * image.ndim
-        pad[axis] = (radius + 1, radius + 1)
-        padded = np.pad(image, pad, "edge")
         count = image.shape[axis]
-        image = sum(tap * np.take(padded, np.arange(count) + i, axis) for i, tap in enumerate(taps))
+        start = np.arange(0, count, scale) + first - 1
+        image = sum(w * np.take(image, np.clip(start + i, 0, count - 1), axis) for i, w in enumerate(weights))
     return image
 
 
-def past(color: np.ndarray) -> np.ndarray:
-    """Where the void is known to be seen, (H, W)."""
+def past(color: np.ndarray, scale: int = 1) -> np.ndarray:
+    """How much of the void is known to be seen, (H, W)."""
     through = np.prod(1.0 - color[..., 3], axis=0)
-    return ((through > 1e-3) | (color[-1, ..., 3] == 0.0)).astype(float)
+    known = ((through > 1e-3) | (color[-1, ..., 3] == 0.0)).astype(float)
+    height, width = known.shape
+    return known.reshape(height // scale, scale, width // scale, scale).mean(axis=(1, 3))
 
 
 def pinhole(color: np.ndarray) -> np.ndarray:
@@ -81,7 +110,7 @@ def trace(layers: np.ndarray, shifts: np.ndarray, color: np.ndarray, void: np.nd
     shifts : (rays, K, 2)
         Right and down, in px.
     color : (M, H, W, 4)
-        The peels: what pixels without rays show.
+        The peels at the middle of each pixel: what pixels without rays show.
     void : (H, W), optional
         For frames that are not opaque.
 
@@ -116,18 +145,24 @@ def render(
     c1: float,
     c0: float,
     bounds: np.ndarray,
+    nominal: np.ndarray,
     windows: list,
-    shifts: np.ndarray,
+    points: np.ndarray,
+    scales: np.ndarray,
     *,
     opaque: bool,
     guard: int = 0,
+    scale: int = 1,
+    least: float = 0.0,
 ) -> np.ndarray:
-    """A whole frame with the same rays at every pixel."""
+    """A whole frame with the same rays at every pixel; peels have ``scale`` times its pixels along x and y."""
     color = color.astype(np.float64)
-    columns = slots(inverse_depth, c1, c0)
+    columns = slots(inverse_depth, c1, c0, scale)
+    coc = centres(color, columns, bounds, nominal, least)
     layers = split(color, columns, bounds)
-    layers = np.stack([cone(one, *window) if window else one for one, window in zip(layers, windows, strict=True)])
-    image = trace(layers, shifts, color, None if opaque else past(color))
+    cones = [cone(one, *window, scale) if window else one for one, window in zip(layers, windows, strict=True)]
+    middle = color[:, scale // 2 :: scale, scale // 2 :: scale]
+    image = trace(np.stack(cones), shifts(points, coc, scales), middle, None if opaque else past(color, scale))
     inner = slice(guard, -guard or None)
     return image[inner, inner]
 

@@ -1,0 +1,236 @@
+"""How ``method="auto"`` keeps an error and a time: the tables of docs/auto.md.
+
+    python -m bench auto                # about five minutes on an idle 2-core machine
+    python -m bench auto --busy         # processor time in place of the clock, for a machine with other work
+
+Errors: 14 built-in scenes x 12 lenses (focus near, on the scene's subject and far; two apertures; disc and Gaussian) at
+192x192, each against its own accumulated reference. What is judged is never what was fitted: for every scene the error
+model is made anew from the tuning measurements of the other 13 (bench/results/auto-tuning.json, with other lenses and
+sizes); only the device's times come from the run itself, by a fit that leaves out the same scene.
+
+Times: frames of 512x512 of every scene, by a renderer of its own for each budget.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cldof import BudgetWarning, LayeredFrame, Lens, Renderer
+from cldof.auto import Budget, Chooser, Curves, Setting, features
+from cldof.capture.peel import DepthPeeler
+from cldof.capture.reference_cache import ReferenceCache
+from cldof.capture.scene import Scene
+from cldof.capture.scenes import builtin_scenes
+from cldof.lens import Aperture
+from cldof.metrics import psnr
+from cldof.tune import (
+    LADDER,
+    ErrorRow,
+    TimeRow,
+    cache_folder,
+    capture,
+    copy_ms,
+    fit_curves,
+    fit_times,
+    frame_ms,
+    make_renderers,
+    reference_for,
+)
+
+TUNING = Path(__file__).parent / "results" / "auto-tuning.json"
+SCENES = (
+    "row", "fence", "foliage", "tabletop", "glass", "floating", "silhouettes", "branches", "plane", "lights", "sky",
+    "near", "floor", "flat",
+)  # fmt: skip
+SIZE, LARGE = 192, 512
+TARGETS_DB = (24, 26, 28, 30, 32, 34)
+BUDGETS_COPIES = (8, 12, 20, 40, 80)
+# A fixed setting meets a target when it does in this share of the cases.
+MOST = 0.95
+
+
+class Case(NamedTuple):
+    """One scene through one lens, with what every setting makes of it."""
+
+    scene: str
+    shape: str
+    feature: NDArray[np.float64]
+    db: NDArray[np.float64]
+    ms: NDArray[np.float64]
+
+
+def judged_lenses(scene: Scene, look: LayeredFrame) -> list[Lens]:
+    """12 lenses: none of them is among those that `cldof tune` fits errors to."""
+    focus, radius = scene.focus_distance_m, scene.aperture_radius_m
+    assert focus is not None and radius is not None
+    seen = 1.0 / look.depth[0][np.isfinite(look.depth[0])].astype(np.float64)
+    near = min(1.0 / float(np.quantile(seen, 0.9)), 0.8 * focus)
+    far = max(1.0 / float(np.quantile(seen, 0.1)), 1.25 * focus)
+    return [
+        Lens(radius * scale, distance, aperture=Aperture.of(shape))
+        for shape in ("disc", "gaussian")
+        for distance in (near, focus, far)
+        for scale in (0.6, 1.4)
+    ]
+
+
+def tuning_rows() -> list[ErrorRow]:
+    """What the shipped curves were fitted to."""
+    data = json.loads(TUNING.read_text())
+    if data["settings"] != [str(setting) for setting in LADDER]:
+        raise SystemExit(f"{TUNING} is of another ladder: make it with `cldof tune --errors --rows {TUNING}`.")
+    return [ErrorRow(row["scene"], np.array(row["feature"]), np.array(row["db"])) for row in data["rows"]]
+
+
+def measured_cases(device: Any, busy: bool, scenes: tuple[str, ...]) -> Iterator[Case]:
+    """Render everything once."""
+    renderers = make_renderers(device)
+    cache = ReferenceCache(cache_folder() / "references")
+    try:
+        with DepthPeeler() as peeler:
+            for name in scenes:
+                scene = builtin_scenes()[name].make()
+                camera = scene.camera_for(SIZE, SIZE)
+                look = peeler.peel(scene, camera, layers=2)
+                for lens in judged_lenses(scene, look):
+                    reference = reference_for(cache, peeler, scene, camera, lens, seed=1, noise_db=40.0, most=512)
+                    frame = capture(peeler, scene, camera, lens, look)
+                    ms = [frame_ms(renderer, frame, lens, 3, busy) for renderer in renderers]
+                    db = [min(50.0, psnr(renderer.render(frame, lens).image, reference)) for renderer in renderers]
+                    feature = features(renderers[0].stats(frame), lens, camera)
+                    yield Case(name, lens.aperture.shape, feature, np.array(db), np.array(ms))
+                print(f"  {name}", flush=True)
+    finally:
+        for renderer in renderers:
+            renderer.close()
+
+
+def chosen(curves: Curves, budget: Budget, unit_ms: float, feature: NDArray[np.float64]) -> int:
+    """The setting that a renderer takes for its first frame."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", BudgetWarning)
+        choice = Chooser(curves, budget, unit_ms).choose(feature)
+    return curves.settings.index(choice.setting)
+
+
+def error_table(cases: list[Case], picks: dict[int, list[int]], which: str) -> list[str]:
+    """Rows of the table for max_error over the cases with an aperture, or all."""
+    rows = np.array([index for index, case in enumerate(cases) if which in (case.shape, "both")])
+    db, ms = (np.array([getattr(cases[index], name) for index in rows]) for name in ("db", "ms"))
+    lines = []
+    for target, pick in picks.items():
+        took = np.array(pick)[rows]
+        at = np.arange(len(rows))
+        can = (db >= target).any(axis=1)
+        met = db[at, took] >= target
+        good = [(float(ms[:, i].mean()), i) for i in range(len(LADDER)) if (db[can, i] >= target).mean() >= MOST]
+        best = min(good) if good else None
+        oracle = np.where(can, np.where(db >= target, ms, np.inf).min(axis=1), ms.min(axis=1)).mean()
+        mean = ms[at, took].mean()
+        fixed = f"{LADDER[best[1]]}, {best[0]:.2f}" if best else "none"
+        ratio = f"{mean / best[0]:.2f}" if best else "-"
+        lines.append(
+            f"| {which} | {target} | {can.mean():.1%} | {met.mean():.1%} | {met[can].mean():.1%} | {mean:.2f} | {fixed}"
+            f" | {ratio} | {oracle:.2f} |"
+        )
+    return lines
+
+
+def judge_errors(cases: list[Case], unit_ms: float) -> list[str]:
+    """The table for max_error."""
+    tuning = tuning_rows()
+    picks: dict[int, list[int]] = {target: [0] * len(cases) for target in TARGETS_DB}
+    for scene in dict.fromkeys(case.scene for case in cases):
+        times = [TimeRow(case.feature, case.ms / unit_ms) for case in cases if case.scene != scene]
+        curves = fit_curves([row for row in tuning if row.scene != scene], times, {})
+        for index, case in enumerate(cases):
+            if case.scene == scene:
+                for target in TARGETS_DB:
+                    picks[target][index] = chosen(curves, Budget.of(f"{target}dB"), unit_ms, case.feature)
+    lines = [
+        "| aperture | max_error, dB | attainable | met, of all | met, of attainable | ms, auto | best fixed setting, ms"
+        " | auto / fixed | ms, oracle |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for which in ("disc", "gaussian", "both"):
+        lines += error_table(cases, picks, which)
+    return lines
+
+
+def judge_times(device: Any, busy: bool, unit_ms: float, cases: list[Case], scenes: tuple[str, ...]) -> list[str]:
+    """The table for max_ms: the first choice alone, and after ten frames that it learns from."""
+    del cases
+    lines = [
+        "| max_ms, copies | attainable | kept, first choice | kept, after 10 frames | mean share of the time used |",
+        "|---|---|---|---|---|",
+    ]
+    shots: list[tuple[LayeredFrame, Lens]] = []
+    with DepthPeeler() as peeler:
+        for name in scenes:
+            scene = builtin_scenes()[name].make()
+            camera = scene.camera_for(LARGE, LARGE)
+            look = peeler.peel(scene, scene.camera_for(SIZE, SIZE), layers=2)
+            lens = judged_lenses(scene, look)[(2, 9)[len(shots) % 2]]
+            shots.append((capture(peeler, scene, camera, lens, look), lens))
+    quickest = [
+        min(_time(Renderer(one.method, device=device, **one.options), frame, lens, busy) for one in LADDER[:4])
+        for frame, lens in shots
+    ]
+    for copies in BUDGETS_COPIES:
+        budget = copies * unit_ms
+        first, later, used = [], [], []
+        for (frame, lens), least in zip(shots, quickest, strict=True):
+            if least > budget:
+                continue
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", BudgetWarning)
+                with Renderer("auto", device=device, max_ms=budget) as renderer:
+                    setting = renderer.render(frame, lens).choice.setting
+                    first.append(_setting_ms(device, setting, frame, lens, busy) <= budget)
+                    for _ in range(9):
+                        setting = renderer.render(frame, lens).choice.setting
+            took = _setting_ms(device, setting, frame, lens, busy)
+            later.append(took <= budget)
+            used.append(took / budget)
+        if first:
+            lines.append(
+                f"| {copies} ({budget:.1f} ms) | {len(first)} of {len(shots)} | {np.mean(first):.0%} | "
+                f"{np.mean(later):.0%} | {np.mean(used):.0%} |"
+            )
+    return lines
+
+
+def _setting_ms(device: Any, setting: Setting, frame: LayeredFrame, lens: Lens, busy: bool) -> float:
+    return _time(Renderer(setting.method, device=device, **setting.options), frame, lens, busy)
+
+
+def _time(renderer: Renderer, frame: LayeredFrame, lens: Lens, busy: bool) -> float:
+    with renderer:
+        return frame_ms(renderer, frame, lens, 5, busy)
+
+
+def report(device: Any = None, busy: bool = False, scenes: tuple[str, ...] = SCENES, output: str | None = None) -> None:
+    """Measure and print the tables."""
+    with Renderer(device=device) as renderer:
+        unit = copy_ms(renderer.device, busy)
+        print(f"{renderer.device.info}, copy of 16 MB {unit:.3f} ms")
+    cases = list(measured_cases(device, busy, scenes))
+    if output:
+        rows = [{"scene": c.scene, "shape": c.shape, "db": c.db.tolist(), "ms": c.ms.tolist()} for c in cases]
+        Path(output).write_text(json.dumps({"settings": [str(one) for one in LADDER], "cases": rows}) + "\n")
+    spread = np.log([case.ms / unit for case in cases])
+    fitted = np.array([case.feature for case in cases]) @ fit_times(
+        [TimeRow(case.feature, case.ms / unit) for case in cases]
+    )
+    print(f"\nTimes follow their model within {math.sqrt(float(((spread - fitted) ** 2).mean())):.0%} (RMS).\n")
+    print("\n".join(judge_errors(cases, unit)))
+    print()
+    print("\n".join(judge_times(device, busy, unit, cases, scenes)))

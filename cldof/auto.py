@@ -1,0 +1,615 @@
+"""``method="auto"``: the cheapest method and setting for an error, or the best for a time.
+
+What each setting costs and how far it errs is measured once per device by ``cldof tune`` (:mod:`cldof.tune`) over the
+built-in scenes and kept as :class:`Curves`: two linear models over :func:`features` of frame and lens, one for the
+error in dB, one for the logarithm of the time. A :class:`Chooser` picks by them, frame after frame, corrects its times
+by what it measures, and changes its mind only when it has to (docs/auto.md).
+
+Errors are RMS over pixels of linear RGB clipped to [0, 1], against what the lens's own aperture would show; in dB they
+are the PSNR of :func:`cldof.metrics.psnr`. A method that simulates another aperture counts with what that costs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import warnings
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import Camera
+from .errors import BudgetWarning, InputError
+from .lens import Lens
+from .planner import SceneStats
+
+__all__ = ["FEATURES", "TARGETS", "Auto", "Budget", "Choice", "Chooser", "Curves", "Setting", "features", "load_curves"]
+
+_FORMAT = 1
+TARGETS = np.arange(20.0, 51.0)
+"""PSNR in dB at which the share of cases is known that a setting is good enough for."""
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A method with its options.
+
+    Attributes
+    ----------
+    method : str
+    options : mapping
+    """
+
+    method: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        options = ", ".join(f"{name}={value}" for name, value in self.options.items())
+        return f"{self.method} ({options})" if options else self.method
+
+
+# Amounts below these are all the same: (name, amount). Features are logarithms of what is above them.
+_FLOORS = {
+    "blur": 0.1,
+    "blur_rms": 0.1,
+    "least_blur": 0.1,
+    "sharp": 0.03,
+    "contrast": 1e-3,
+    "texture": 1e-4,
+    "blurred_contrast": 1e-4,
+    "silhouettes": 1e-4,
+    "near_silhouettes": 1e-4,
+    "far_silhouettes": 1e-4,
+    "edges": 1e-2,
+    "hidden": 1e-4,
+    "hidden_contrast": 1e-4,
+    "deep": 1e-2,
+    "lights": 1e-3,
+    "light_tiles": 1e-3,
+    "spread_lights": 1e-3,
+    "glass": 1e-2,
+    "void": 1e-2,
+    "luminance": 0.03,
+    "near_coc": 0.5,
+    "far_coc": 0.5,
+}
+FEATURES = ("one", "is_disc", "pixels", "peels", *_FLOORS)
+"""What models are linear in; all but the first two are logarithms."""
+
+# CoC radii (px) from which on more of them changes an error no further.
+_FULL_TEXTURE_PX, _FULL_SILHOUETTE_PX = 4.0, 8.0
+# CoC steps (px) inside a tile that are a silhouette, and CoC below which a tile is sharp.
+_STEP_PX, _SHARP_PX = 0.5, 0.5
+# HDR values above this count as this.
+_BRIGHTEST = 30.0
+
+
+def features(stats: SceneStats, lens: Lens, camera: Camera) -> Vector:
+    """A frame seen through a lens, in the numbers that errors and times depend on.
+
+    Parameters
+    ----------
+    stats : SceneStats
+        Of the frame; per tile of 16 x 16 pixels.
+    lens : Lens
+    camera : Camera
+        The frame's.
+
+    Returns
+    -------
+    ndarray, (len(FEATURES),), float64
+    """
+    c1, c0 = lens.coc_coefficients(camera)
+    has = stats.slots[:2] > 0.0
+    with np.errstate(invalid="ignore"):
+        near = np.where(has, c1 * stats.nearest[:2] + c0, 0.0)
+        far = np.where(has, c1 * stats.farthest[:2] + c0, 0.0)
+    share = stats.pixels / float(stats.pixels.sum())
+
+    def mean(values: NDArray[Any]) -> float:
+        return float((values * share).sum())
+
+    largest = np.maximum(np.abs(near[0]), np.abs(far[0]))
+    least = np.where(near[0] * far[0] <= 0.0, 0.0, np.minimum(np.abs(near[0]), np.abs(far[0])))
+    step = np.where(has[0], abs(c1) * stats.step[0], 0.0)
+    high = np.where(has[..., None], stats.high[:2, ..., :3], 0.0)
+    low = np.where(has[..., None], stats.low[:2, ..., :3], 0.0)
+    contrast = ((np.minimum(high, 1.0) - np.minimum(low, 1.0)) ** 2).mean(axis=-1)
+    occupancy = stats.slots / stats.pixels
+    in_front, behind = np.clip(-near[0], 0.0, _FULL_SILHOUETTE_PX), np.clip(far[0], 0.0, _FULL_SILHOUETTE_PX)
+    is_edge, is_blurred = step > _STEP_PX, largest > _SHARP_PX
+    light = np.clip(high[0].max(axis=-1) - 1.0, 0.0, _BRIGHTEST)
+    amounts = {
+        "blur": mean(largest),
+        "blur_rms": math.sqrt(mean(largest**2)),
+        "least_blur": mean(least),
+        "sharp": mean(~is_blurred),
+        "contrast": mean(contrast[0]),
+        "texture": mean(contrast[0] * np.minimum(least, _FULL_TEXTURE_PX)),
+        "blurred_contrast": mean(contrast[0] * np.minimum(largest, 1.0)),
+        "silhouettes": mean(contrast[0] * np.minimum(step, _FULL_SILHOUETTE_PX)),
+        "near_silhouettes": mean(contrast[0] * in_front * is_edge),
+        "far_silhouettes": mean(contrast[0] * behind * is_edge),
+        "edges": mean(is_edge),
+        "hidden": mean(occupancy[1] * in_front * contrast[1]) if len(occupancy) > 1 else 0.0,
+        "hidden_contrast": mean(occupancy[1] * contrast[1] * is_edge) if len(occupancy) > 1 else 0.0,
+        "deep": mean(occupancy[2:].sum(axis=0)),
+        "lights": mean(light * is_blurred),
+        "light_tiles": mean((light > 0.0) & is_blurred),
+        "spread_lights": mean(light / (1.0 + math.pi * largest**2) * is_blurred),
+        "glass": mean(1.0 - stats.solid[0] / np.maximum(stats.slots[0], 1.0)),
+        "void": mean(1.0 - np.minimum(1.0, occupancy.max(axis=0))),
+        "luminance": mean(stats.luminance[0]),
+        "near_coc": max(0.0, -float(near.min())),
+        "far_coc": max(0.0, float(far.max())),
+    }
+    is_disc = float(lens.aperture.shape != "gaussian")
+    fixed = [1.0, is_disc, math.log10(stats.shape.height * stats.shape.width), math.log10(stats.shape.layers)]
+    return np.array(fixed + [math.log10(amounts[name] + floor) for name, floor in _FLOORS.items()])
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a frame may err or take; one of both.
+
+    Attributes
+    ----------
+    max_rms : float, optional
+        RMS error, linear units.
+    max_ms : float, optional
+        From the call to the image on the host.
+    """
+
+    max_rms: float | None = None
+    max_ms: float | None = None
+
+    @classmethod
+    def of(cls, max_error: float | str | None = None, max_ms: float | None = None) -> Budget:
+        """Read what a caller asks for.
+
+        Parameters
+        ----------
+        max_error : float or str, optional
+            ``"35dB"`` or ``"0.018"``; numbers from 5 on are dB, numbers below 1 are linear RMS.
+        max_ms : float, optional
+
+        Raises
+        ------
+        InputError
+            Neither or both, or a number that is neither an RMS nor dB.
+        """
+        if (max_error is None) == (max_ms is None):
+            raise InputError("method='auto' needs max_error (such as '35dB') or max_ms (such as 40), one of both.")
+        if max_ms is not None:
+            milliseconds = _number(max_ms, "max_ms")
+            if not 0.0 < milliseconds < math.inf:
+                raise InputError(f"max_ms is {max_ms!r}; it must be positive and finite.")
+            return cls(max_ms=milliseconds)
+        text = str(max_error).strip().lower()
+        value = _number(text.removesuffix("db"), "max_error")
+        is_db = text.endswith("db") or value >= 5.0
+        if not (0.0 < value < 1.0 or (is_db and 0.0 < value <= 200.0)):
+            raise InputError(
+                f"max_error is {max_error!r}; give dB such as 35 or '35dB', or a linear RMS below 1 such as 0.018."
+            )
+        return cls(max_rms=10.0 ** (-value / 20.0) if is_db else value)
+
+    @property
+    def min_db(self) -> float | None:
+        """The error as PSNR."""
+        return None if self.max_rms is None else -20.0 * math.log10(self.max_rms)
+
+
+def _number(value: Any, name: str) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {value!r}; it must be a number.") from None
+
+
+@dataclass(frozen=True)
+class Auto:
+    """Stands where a method stands, until a frame is there to choose one for.
+
+    Parameters
+    ----------
+    max_error : float or str, optional
+        PSNR in dB that a frame must reach (``"35dB"``; numbers from 5 on), or RMS that it may err by, in linear units
+        (numbers below 1).
+    max_ms : float, optional
+        Time for a frame, from the call to the image on the host.
+    """
+
+    max_error: float | str | None = None
+    max_ms: float | None = None
+
+    name = "auto"
+    simulated_aperture = None
+
+    @property
+    def budget(self) -> Budget:
+        """What was asked for.
+
+        Raises
+        ------
+        InputError
+        """
+        return Budget.of(self.max_error, self.max_ms)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen for a frame, and what is expected of it.
+
+    Attributes
+    ----------
+    setting : Setting
+    predicted_ms : float
+        Once programs are built and buffers made; corrected by the frames before.
+    predicted_db : float
+        PSNR expected against the lens's own aperture; half of all frames do better.
+    uncertainty_db : float
+        Standard deviation of such predictions on scenes that they were not made from.
+    meets_budget : bool
+        Whether the prediction keeps the budget.
+    reason : str
+    """
+
+    setting: Setting
+    predicted_ms: float
+    predicted_db: float
+    uncertainty_db: float
+    meets_budget: bool
+    reason: str
+
+    @property
+    def predicted_rms(self) -> float:
+        """The error expected, RMS in linear units."""
+        return math.pow(10.0, -self.predicted_db / 20.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for reports."""
+        return {
+            "method": self.setting.method,
+            "options": dict(self.setting.options),
+            "predicted_ms": self.predicted_ms,
+            "predicted_db": self.predicted_db,
+            "predicted_rms": self.predicted_rms,
+            "uncertainty_db": self.uncertainty_db,
+            "meets_budget": self.meets_budget,
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Accuracy versus time of each setting on one device, as linear models over :data:`FEATURES`.
+
+    Attributes
+    ----------
+    settings : tuple of Setting
+    error_db : ndarray, (F, S)
+        Weights: features @ error_db is the PSNR in dB.
+    log_time : ndarray, (F, S)
+        Weights: features @ log_time is the natural logarithm of the time in copies of 16 MB on the device.
+    low, high : ndarray, (F,)
+        Range of the features that errors were measured at; beyond it, the ends hold.
+    kept : mapping
+        By aperture, ``"gaussian"`` or ``"disc"``, (T, S): of the cases in which some setting reached the PSNR of
+        :data:`TARGETS`, the share in which each did.
+    uncertainty_db : ndarray, (S,)
+        RMS error of predictions for scenes that they were not made from.
+    source : mapping
+        Device, driver, version and when: for people, and to know which curves are whose.
+    """
+
+    settings: tuple[Setting, ...]
+    error_db: Vector
+    log_time: Vector
+    low: Vector
+    high: Vector
+    kept: Mapping[str, Vector]
+    uncertainty_db: Vector
+    source: Mapping[str, Any]
+
+    def errors(self, feature: Vector) -> Vector:
+        """PSNR in dB expected of each setting, (S,)."""
+        predicted: Vector = np.clip(feature, self.low, self.high) @ self.error_db
+        return predicted
+
+    def copies(self, feature: Vector) -> Vector:
+        """Time expected of each setting in copies, (S,)."""
+        inside = np.clip(feature, self.low, self.high)
+        inside[_SCALING] = feature[_SCALING]
+        time: Vector = np.exp(np.clip(inside @ self.log_time, -10.0, 20.0))
+        return time
+
+    def share_kept(self, feature: Vector, min_db: float) -> Vector:
+        """The share of tuning cases in which each setting reached a PSNR that some setting reached, (S,)."""
+        kept = self.kept["disc" if feature[FEATURES.index("is_disc")] else "gaussian"]
+        # Between two targets what holds for the higher one; beyond the last nothing is known.
+        row = int(np.searchsorted(TARGETS, min_db))
+        share: Vector = kept[row] if row < len(TARGETS) else np.zeros(kept.shape[1])
+        return share
+
+    def to_json(self) -> str:
+        """As :meth:`from_json` reads it."""
+        data = {
+            "format": _FORMAT,
+            "features": list(FEATURES),
+            "settings": [{"method": one.method, "options": dict(one.options)} for one in self.settings],
+            "error_db": _rounded(self.error_db),
+            "log_time": _rounded(self.log_time),
+            "low": _rounded(self.low),
+            "high": _rounded(self.high),
+            "kept": {shape: _rounded(share) for shape, share in self.kept.items()},
+            "uncertainty_db": _rounded(self.uncertainty_db),
+            "source": dict(self.source),
+        }
+        return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Curves:
+        """Read what :meth:`to_json` wrote.
+
+        Raises
+        ------
+        InputError
+            Anything about it is not as it should be.
+        """
+        try:
+            data = json.loads(text)
+            if data["format"] != _FORMAT or tuple(data["features"]) != FEATURES:
+                raise InputError("The curves are of another version of cldof; run `cldof tune` again.")
+            settings = tuple(Setting(str(one["method"]), dict(one["options"])) for one in data["settings"])
+            shape = (len(FEATURES), len(settings))
+            return cls(
+                settings,
+                _array(data["error_db"], shape),
+                _array(data["log_time"], shape),
+                _array(data["low"], shape[:1]),
+                _array(data["high"], shape[:1]),
+                {name: _array(data["kept"][name], (len(TARGETS), shape[1])) for name in ("gaussian", "disc")},
+                _array(data["uncertainty_db"], shape[1:]),
+                dict(data["source"]),
+            )
+        except InputError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"The curves cannot be read ({type(error).__name__}: {error}).") from error
+
+
+_SCALING = [FEATURES.index("pixels"), FEATURES.index("peels")]
+
+
+def _rounded(values: Vector) -> Any:
+    return np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[float])(values).tolist()
+
+
+def _array(values: Any, shape: tuple[int, ...]) -> Vector:
+    array = np.array(values, np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(f"The curves hold an array of shape {array.shape} where {shape} is needed, or no numbers.")
+    return array
+
+
+def load_curves(device: str, driver: str, folder: Path | None = None) -> Curves:
+    """The curves of a device: those that ``cldof tune`` has kept, or those that come with cldof.
+
+    Parameters
+    ----------
+    device, driver : str
+        The device's name and its driver's version.
+    folder : Path, optional
+        Where `cldof tune` keeps them; :func:`cache_folder` by default.
+
+    Returns
+    -------
+    Curves
+        A file that is damaged or of another version is warned of and passed over.
+    """
+    path = (folder or cache_folder()) / curves_name(device, driver)
+    try:
+        return Curves.from_json(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        pass
+    except (OSError, UnicodeDecodeError, InputError) as error:
+        warnings.warn(f"{path} is passed over: {error} Run `cldof tune`.", UserWarning, stacklevel=2)
+    return shipped_curves()
+
+
+def cache_folder() -> Path:
+    """Where curves are kept: ``CLDOF_CACHE``, else ``cldof`` in the user's cache folder."""
+    own = os.environ.get("CLDOF_CACHE")
+    if own:
+        return Path(own)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cldof"
+
+
+def shipped_curves() -> Curves:
+    """Curves measured with PoCL on a 2-core x86-64 CPU, as shipped."""
+    return Curves.from_json((resources.files(__package__) / "curves" / "pocl.json").read_text(encoding="utf-8"))
+
+
+def curves_name(device: str, driver: str) -> str:
+    """Name of the file that holds a device's curves."""
+    from . import __version__
+
+    key = hashlib.sha256(f"{device}\n{driver}\n{__version__}\n{_FORMAT}".encode()).hexdigest()[:16]
+    plain = "".join(letter if letter.isalnum() else "-" for letter in device)[:40]
+    return f"curves-{plain}-{key}.json"
+
+
+# Settings that kept an error in this share of the tuning cases (or in nearly as many as the best did) are trusted with
+# it, unless the prediction is this much too low.
+_TRUSTED, _NEARLY, _DISTRUST_DB = 0.97, 0.02, 1.0
+# Others are taken when they are expected to do better by so many of their uncertainties: a cheaper one in place of a
+# trusted one, and any where none is trusted.
+_DOWNGRADE, _MARGIN = 1.5, 1.0
+# Share of a time that is left unused, for what the model does not know: before a method's first frame and after.
+_HEADROOM, _LATER_HEADROOM = 0.25, 0.08
+# Frames of a setting whose median time corrects the model: one that was held up does not count.
+_REMEMBERED = 5
+# Frames in a row for which another setting has to be better by this much before it is taken.
+_PATIENCE, _CHEAPER, _BETTER_DB = 12, 0.8, 1.0
+# What runs may be expected to be this much worse than what would be taken anew.
+_LENIENCE_DB = 1.0
+# Settings within this of the least error are as good, and the cheapest of them is taken.
+_AS_GOOD_DB = 0.5
+
+
+class Chooser:
+    """Picks settings for a budget, frame after frame.
+
+    Parameters
+    ----------
+    curves : Curves
+    budget : Budget
+    copy_ms : float
+        What a copy of 16 MB takes on the device now.
+    """
+
+    def __init__(self, curves: Curves, budget: Budget, copy_ms: float) -> None:
+        self.curves, self.budget, self.copy_ms = curves, budget, copy_ms
+        self._current: int | None = None
+        self._wished_for = 0
+        # Logarithms of measured over predicted time of the last frames, by setting; one that has not run yet takes over
+        # those of its method's others.
+        self._ratios: dict[int, deque[float]] = {}
+        self._warned: int | None = None
+
+    def choose(self, feature: Vector) -> Choice:
+        """The setting for a frame.
+
+        Parameters
+        ----------
+        feature : ndarray
+            Of :func:`features`.
+
+        Warns
+        -----
+        BudgetWarning
+            No setting is expected to keep the budget: by how much. Once, until it changes.
+        """
+        errors, times = self.curves.errors(feature), self._times(feature)
+        wished, reason = self._wish(feature, errors, times)
+        taken = wished
+        current = self._current
+        if current is not None and wished != current and self._keeps(current, feature, errors, times):
+            # Nothing is wrong with what runs: change for a gain that lasts, since a change can be seen.
+            if self.budget.max_ms is None:
+                gains = times[wished] < _CHEAPER * times[current]
+            else:
+                gains = errors[wished] > errors[current] + _BETTER_DB
+            self._wished_for = self._wished_for + 1 if gains else 0
+            if self._wished_for < _PATIENCE:
+                taken, reason = current, "kept from the frame before"
+        if taken == wished:
+            self._wished_for = 0
+        self._current = taken
+        choice = Choice(
+            self.curves.settings[taken],
+            float(times[taken]),
+            float(errors[taken]),
+            float(self.curves.uncertainty_db[taken]),
+            self._meets(taken, errors, times),
+            reason,
+        )
+        self._warn(taken, choice)
+        return choice
+
+    def observe(self, choice: Choice, feature: Vector, ms: float) -> None:
+        """Learn from what a frame took, programs and buffers left out; its choice is one of :meth:`choose`."""
+        index = self.curves.settings.index(choice.setting)
+        predicted = float(self.curves.copies(feature)[index]) * self.copy_ms
+        self._ratios.setdefault(index, deque(maxlen=_REMEMBERED)).append(math.log(max(ms, 1e-6) / predicted))
+
+    def _times(self, feature: Vector) -> Vector:
+        known = {index: median(ratios) for index, ratios in self._ratios.items()}
+        corrections = np.zeros(len(self.curves.settings))
+        for index, setting in enumerate(self.curves.settings):
+            family = [known[other] for other in known if self.curves.settings[other].method == setting.method]
+            corrections[index] = known.get(index, sum(family) / len(family) if family else 0.0)
+        return np.asarray(self.curves.copies(feature) * self.copy_ms * np.exp(corrections))
+
+    def _wish(self, feature: Vector, errors: Vector, times: Vector) -> tuple[int, str]:
+        if self.budget.max_ms is not None:
+            return self._best_for_time(errors, times)
+        return self._cheapest_for_error(feature, errors, times)
+
+    def _best_for_time(self, errors: Vector, times: Vector) -> tuple[int, str]:
+        assert self.budget.max_ms is not None
+        fits = np.flatnonzero(times <= self.budget.max_ms * (1.0 - self._headroom()))
+        if not fits.size:
+            return int(times.argmin()), "the quickest there is"
+        return _nearly_best(fits, errors, times), f"the least error of {fits.size} settings that fit"
+
+    def _cheapest_for_error(self, feature: Vector, errors: Vector, times: Vector) -> tuple[int, str]:
+        target = self.budget.min_db
+        assert target is not None
+        trusted = self._trusted(feature, errors, _DISTRUST_DB)
+        spare = (_DOWNGRADE if trusted.any() else _MARGIN) * self.curves.uncertainty_db
+        good = np.flatnonzero(trusted | (errors >= target + spare))
+        if good.size:
+            return int(good[times[good].argmin()]), f"the cheapest of {good.size} settings for this error"
+        return _nearly_best(np.arange(len(errors)), errors, times), "the least error there is"
+
+    def _trusted(self, feature: Vector, errors: Vector, distrust_db: float) -> NDArray[np.bool_]:
+        target = self.budget.min_db
+        assert target is not None
+        kept = self.curves.share_kept(feature, target)
+        return np.asarray((kept >= min(_TRUSTED, kept.max() - _NEARLY)) & (errors >= target - distrust_db) & (kept > 0))
+
+    def _headroom(self) -> float:
+        return _LATER_HEADROOM if self._ratios else _HEADROOM
+
+    def _keeps(self, index: int, feature: Vector, errors: Vector, times: Vector) -> bool:
+        """Whether a setting that runs may go on: the budget with less margin than a new one needs."""
+        if self.budget.max_ms is not None:
+            return bool(times[index] <= self.budget.max_ms)
+        assert self.budget.min_db is not None
+        is_trusted = self._trusted(feature, errors, _DISTRUST_DB + _LENIENCE_DB)[index]
+        spare = _MARGIN * self.curves.uncertainty_db[index]
+        return bool(is_trusted or errors[index] >= self.budget.min_db + spare - _LENIENCE_DB)
+
+    def _meets(self, index: int, errors: Vector, times: Vector) -> bool:
+        if self.budget.max_ms is not None:
+            return bool(times[index] <= self.budget.max_ms)
+        assert self.budget.min_db is not None
+        return bool(errors[index] >= self.budget.min_db)
+
+    def _warn(self, index: int, choice: Choice) -> None:
+        if choice.meets_budget:
+            self._warned = None
+            return
+        if self._warned == index:
+            return
+        self._warned = index
+        if self.budget.max_ms is not None:
+            what = (
+                f"max_ms={self.budget.max_ms:g} is {choice.predicted_ms / self.budget.max_ms:.1f} times too short for "
+                f"the quickest setting, {choice.setting}: {choice.predicted_ms:.1f} ms expected"
+            )
+        else:
+            assert self.budget.min_db is not None
+            what = (
+                f"no setting is sure to reach {self.budget.min_db:.1f} dB; the nearest, {choice.setting}, is expected "
+                f"to miss it by {self.budget.min_db - choice.predicted_db:.1f} dB ({choice.predicted_db:.1f} dB)"
+            )
+        warnings.warn(f"{what}.", BudgetWarning, stacklevel=4)
+
+
+def _nearly_best(among: NDArray[np.intp], errors: Vector, times: Vector) -> int:
+    """The cheapest of those whose error is hardly larger than the least."""
+    as_good = among[errors[among] >= errors[among].max() - _AS_GOOD_DB]
+    return int(as_good[times[as_good].argmin()])

@@ -1,0 +1,476 @@
+"""Choosing a method for an error or a time."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cldof import BudgetWarning, Camera, InputError, LayeredFrame, Lens, Renderer
+from cldof.auto import (
+    FEATURES,
+    TARGETS,
+    Budget,
+    Chooser,
+    Curves,
+    Setting,
+    cache_folder,
+    curves_name,
+    features,
+    load_curves,
+    shipped_curves,
+)
+from cldof.cli import main
+from cldof.host.device import Device, DeviceInfo
+from cldof.methods import make_method
+from cldof.renderer import frame_stats
+from cldof.tune import LADDER, ErrorRow, TimeRow, fit_curves, fit_times, frame_ms, save_rows, tune
+from tests.frames import noise_frame, plane_frame
+from tests.opengl import require_opengl
+
+AMOUNT = FEATURES.index("contrast")  # the one feature that the curves below depend on
+SETTINGS = (Setting("gather"), Setting("layered"), Setting("layered", {"layers": 6}), Setting("multiview"))
+
+
+def feature(amount: float = 0.0) -> np.ndarray:
+    one = np.zeros(len(FEATURES))
+    one[0], one[AMOUNT] = 1.0, amount
+    return one
+
+
+def curves(
+    db: Sequence[float], copies: Sequence[float], slope: float = 0.0, kept: float | Sequence[float] = 1.0
+) -> Curves:
+    """Each setting at a PSNR (falling by ``slope`` per unit of the amount) and a time, trusted everywhere or not."""
+    error_db, log_time = np.zeros((2, len(FEATURES), len(SETTINGS)))
+    error_db[0], error_db[AMOUNT], log_time[0] = db, -slope, np.log(copies)
+    low, high = np.full(len(FEATURES), -100.0), np.full(len(FEATURES), 100.0)
+    shares = np.broadcast_to(kept, (len(TARGETS), len(SETTINGS))).astype(np.float64)
+    return Curves(
+        SETTINGS, error_db, log_time, low, high, {"disc": shares, "gaussian": shares}, np.full(len(SETTINGS), 2.0), {}
+    )
+
+
+def first(given: Curves, budget: Budget, amount: float = 0.0, copy_ms: float = 1.0) -> Setting:
+    return Chooser(given, budget, copy_ms).choose(feature(amount)).setting
+
+
+# Budgets
+
+
+@pytest.mark.parametrize(
+    "given, rms",
+    [("20dB", 0.1), ("20 dB", 0.1), (20, 0.1), (40.0, 0.01), ("0.02", 0.02), (0.02, 0.02), ("3dB", 10 ** (-3 / 20))],
+)
+def test_errors_are_read_as_db_or_linear(given: float | str, rms: float) -> None:
+    budget = Budget.of(given)
+    assert budget.max_rms == pytest.approx(rms) and budget.max_ms is None
+    assert budget.min_db == pytest.approx(-20.0 * math.log10(rms))
+
+
+@pytest.mark.parametrize(
+    "error, ms", [(None, None), (30, 5.0), (2, None), (-0.1, None), (0, None), ("dB", None), (math.nan, None),
+                  (None, 0), (None, -1), (None, math.inf), (None, "fast")],
+)  # fmt: skip
+def test_impossible_budgets_are_refused(error: float | str | None, ms: float | None) -> None:
+    with pytest.raises(InputError):
+        Budget.of(error, ms)
+
+
+# Features
+
+
+def named(frame: LayeredFrame, lens: Lens, device: Device) -> dict[str, float]:
+    return dict(zip(FEATURES, features(frame_stats(device, frame), lens, frame.camera), strict=True))
+
+
+def test_features_of_a_plane(device: Device) -> None:
+    image = np.ones((32, 48, 4))
+    image[:, ::2, :3] = 0.5
+    frame = plane_frame(image, 2.0)
+    sharp = named(frame, Lens(0.05, 2.0, aperture="gaussian"), device)
+    assert (sharp["one"], sharp["is_disc"], sharp["peels"]) == (1.0, 0.0, 0.0)
+    assert 10 ** sharp["pixels"] == pytest.approx(32 * 48)
+    assert 10 ** sharp["blur"] == pytest.approx(0.1, abs=1e-5) and 10 ** sharp["sharp"] == pytest.approx(1.03)
+    assert 10 ** sharp["contrast"] == pytest.approx(0.25 + 1e-3)
+    lens = Lens(0.05, 1.0)
+    coc = float(lens.coc_radius_px(frame.camera, 2.0))
+    blurred = named(frame, lens, device)
+    assert blurred["is_disc"] == 1.0 and 10 ** blurred["sharp"] == pytest.approx(0.03)
+    assert 10 ** blurred["blur"] == pytest.approx(coc + 0.1, rel=1e-4)
+    assert 10 ** blurred["far_coc"] == pytest.approx(coc + 0.5, rel=1e-4)
+    assert 10 ** blurred["near_coc"] == pytest.approx(0.5)
+    assert 10 ** blurred["texture"] == pytest.approx(0.25 * min(coc, 4.0) + 1e-4, rel=1e-3)
+    assert 10 ** blurred["silhouettes"] == pytest.approx(1e-4, rel=1e-3)  # a plane has none
+
+
+def test_features_see_silhouettes_lights_glass_and_void(device: Device) -> None:
+    lens = Lens(0.05, 1.0)
+    image = np.ones((32, 32, 4))
+    image[:, 8:, :3] = 0.25
+    depth = np.full((32, 32), 1.0, np.float32)
+    depth[:, 8:] = 4.0
+    camera = Camera(32, 32, 40.0)
+    stepped = LayeredFrame(image.astype(np.float32), depth, camera)
+    flat = named(plane_frame(image, 4.0), lens, device)
+    found = named(stepped, lens, device)
+    assert found["silhouettes"] > flat["silhouettes"] + 1.0 and found["far_silhouettes"] > flat["far_silhouettes"] + 1.0
+    bright = image.copy()
+    bright[20, 20, :3] = 9.0
+    lit = named(plane_frame(bright, 4.0), lens, device)
+    assert 10 ** lit["lights"] == pytest.approx(8.0 / 4 + 1e-3, rel=1e-3)  # in one of four tiles
+    pane = image * 0.5
+    glass = named(plane_frame(pane, 4.0), lens, device)
+    assert 10 ** glass["glass"] == pytest.approx(1.01, rel=1e-3)
+    hole = image.copy()
+    hole[:16] = 0.0
+    void = named(plane_frame(hole, 4.0), lens, device)
+    assert 10 ** void["void"] == pytest.approx(0.51, rel=1e-3)
+
+
+@pytest.mark.parametrize("opaque", [True, False])
+def test_features_are_numbers_for_anything(opaque: bool, device: Device) -> None:
+    for size, lens in (((1, 1), Lens(0.1, 1.0)), ((37, 21), Lens(0.0, math.inf)), ((5, 64), Lens(3.0, 0.1))):
+        frame = noise_frame(*size, layers=3, seed=1, opaque=opaque)
+        assert np.isfinite(features(frame_stats(device, frame), lens, frame.camera)).all()
+    nothing = LayeredFrame(np.zeros((8, 8, 4), np.float32), np.full((8, 8), np.inf, np.float32), Camera(8, 8))
+    assert np.isfinite(features(frame_stats(device, nothing), Lens(0.1, 1.0), nothing.camera)).all()
+
+
+# Choosing
+
+
+def test_the_cheapest_trusted_setting_is_taken_for_an_error() -> None:
+    given = curves([25, 40, 33, 45], [1, 4, 2, 9], kept=[0.5, 1.0, 0.98, 1.0])
+    assert first(given, Budget.of("30dB")) == SETTINGS[2]
+    # Predicted 1 dB too low and more, it is not trusted any longer.
+    assert first(curves([25, 40, 28.9, 45], [1, 4, 2, 9], kept=[0.5, 1.0, 0.98, 1.0]), Budget.of("30dB")) == SETTINGS[1]
+
+
+def test_an_untrusted_setting_is_taken_when_it_is_expected_to_do_much_better() -> None:
+    shares = [0.5, 1.0, 0.98, 1.0]
+    assert first(curves([32.9, 40, 33, 45], [1, 4, 2, 9], kept=shares), Budget.of("30dB")) == SETTINGS[2]
+    assert first(curves([33.1, 40, 33, 45], [1, 4, 2, 9], kept=shares), Budget.of("30dB")) == SETTINGS[0]
+
+
+def test_where_nothing_is_trusted_the_expectation_decides() -> None:
+    given = curves([25, 33, 31, 45], [1, 4, 2, 9], kept=0.0)
+    assert first(given, Budget.of("30dB")) == SETTINGS[1]
+    assert first(given, Budget.of("31.5dB")) == SETTINGS[3]
+
+
+def test_an_error_out_of_reach_takes_the_nearest_and_says_by_how_much() -> None:
+    given = curves([25, 39.8, 33, 40], [1, 4, 2, 9], kept=0.0)
+    with pytest.warns(BudgetWarning, match=r"60\.0 dB; the nearest, layered, is expected to miss it by 20\.2 dB"):
+        choice = Chooser(given, Budget.of("60dB"), 1.0).choose(feature())
+    # 0.2 dB are not worth twice the time.
+    assert choice.setting == SETTINGS[1] and not choice.meets_budget
+    assert choice.predicted_db == pytest.approx(39.8) and choice.predicted_rms == pytest.approx(10 ** (-39.8 / 20))
+
+
+def test_the_least_error_that_fits_is_taken_for_a_time() -> None:
+    given = curves([25, 40, 33, 45], [1, 4, 2, 9])
+    assert first(given, Budget.of(max_ms=100)) == SETTINGS[3]
+    assert first(given, Budget.of(max_ms=9.5)) == SETTINGS[1]  # within the headroom nothing is promised
+    assert first(given, Budget.of(max_ms=9.5), copy_ms=2.0) == SETTINGS[2]
+    assert first(curves([25, 40, 39.8, 45], [1, 4, 2, 90]), Budget.of(max_ms=20)) == SETTINGS[2]
+
+
+def test_a_time_out_of_reach_takes_the_quickest_and_says_by_how_much() -> None:
+    with pytest.warns(BudgetWarning, match=r"max_ms=0\.5 is 2\.0 times too short for the quickest setting, gather"):
+        choice = Chooser(curves([25, 40, 33, 45], [1, 4, 2, 9]), Budget.of(max_ms=0.5), 1.0).choose(feature())
+    assert choice.setting == SETTINGS[0] and not choice.meets_budget
+
+
+def test_a_warning_comes_once_until_something_changes() -> None:
+    chooser = Chooser(curves([25, 40, 33, 45], [1, 4, 2, 9], slope=1.0), Budget.of("50dB"), 1.0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for amount in (0.0, 0.0, 0.0, -20.0, -20.0, 0.0):
+            chooser.choose(feature(amount))
+    assert len(caught) == 2
+
+
+def test_what_runs_goes_on_until_a_gain_lasts() -> None:
+    given = curves([35, 45, 20, 20], [1, 4, 9, 9], slope=1.0, kept=0.0)
+    chooser = Chooser(given, Budget.of("30dB"), 1.0)
+    assert chooser.choose(feature(5.0)).setting == SETTINGS[1]
+    # From here on the cheaper one would do; now and then it would not.
+    for frame in range(40):
+        assert chooser.choose(feature(5.0 if frame % 6 == 5 else 0.0)).setting == SETTINGS[1]
+    chooser.choose(feature(5.0))
+    taken = [chooser.choose(feature(0.0)).setting for _ in range(30)]
+    assert taken == [SETTINGS[1]] * 11 + [SETTINGS[0]] * 19
+
+
+def test_a_budget_that_is_missed_changes_the_setting_at_once() -> None:
+    given = curves([35, 45, 20, 20], [1, 4, 9, 9], slope=1.0, kept=0.0)
+    chooser = Chooser(given, Budget.of("30dB"), 1.0)
+    assert chooser.choose(feature(0.0)).setting == SETTINGS[0]
+    assert chooser.choose(feature(3.5)).setting == SETTINGS[0]  # hardly worse
+    assert chooser.choose(feature(6.0)).setting == SETTINGS[1]
+
+
+def test_times_are_corrected_by_what_frames_took() -> None:
+    given = curves([25, 40, 33, 45], [1, 4, 2, 9])
+    chooser = Chooser(given, Budget.of(max_ms=20), 1.0)
+    choice = chooser.choose(feature())
+    assert choice.setting == SETTINGS[3] and choice.predicted_ms == pytest.approx(9.0)
+    chooser.observe(choice, feature(), 36.0)
+    choice = chooser.choose(feature())
+    assert choice.setting == SETTINGS[1]  # of another method, which nothing is known of
+    chooser.observe(choice, feature(), 12.0)
+    assert chooser.choose(feature()).predicted_ms == pytest.approx(12.0)
+    # A method's settings share what is known of one of them; a single frame that was held up does not count.
+    for took in (12.0, 500.0, 12.0, 12.0):
+        chooser.observe(choice, feature(), took)
+    assert chooser.choose(feature()).predicted_ms == pytest.approx(12.0)
+    assert chooser._times(feature())[2] == pytest.approx(6.0)
+
+
+# Files
+
+
+def test_curves_survive_their_file() -> None:
+    given = shipped_curves()
+    again = Curves.from_json(given.to_json())
+    assert again.settings == given.settings == LADDER
+    for name in ("error_db", "log_time", "low", "high", "uncertainty_db"):
+        assert np.array_equal(getattr(again, name), getattr(given, name))
+    assert all(make_method(one.method, **one.options) for one in given.settings)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data.update(format=99),
+        lambda data: data.update(features=["one"]),
+        lambda data: data.pop("kept"),
+        lambda data: data["log_time"].pop(),
+        lambda data: data["error_db"][0].__setitem__(0, "x"),
+        lambda data: data.update(low=None),
+        lambda data: data.update(settings=3),
+    ],
+)
+def test_damaged_curves_are_refused(damage: object) -> None:
+    data = json.loads(shipped_curves().to_json())
+    damage(data)  # type: ignore[operator]
+    with pytest.raises(InputError):
+        Curves.from_json(json.dumps(data))
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b'{"format": 1}', b"null"])
+def test_a_damaged_file_is_warned_of_and_passed_over(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / curves_name("device", "1.0")).write_bytes(content)
+    with pytest.warns(UserWarning, match="passed over"):
+        assert load_curves("device", "1.0", tmp_path).source == shipped_curves().source
+    assert load_curves("device", "2.0", tmp_path).source == shipped_curves().source  # another driver, another file
+
+
+def test_the_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CLDOF_CACHE", str(tmp_path))
+    assert cache_folder() == tmp_path
+    monkeypatch.delenv("CLDOF_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "cldof"
+
+
+# Fitting
+
+
+def rows(seed: int, count: int = 240) -> tuple[list[ErrorRow], list[TimeRow], np.ndarray]:
+    """Measurements that follow models of known weights, over features of ordinary size."""
+    rng = np.random.default_rng(seed)
+    weights = rng.normal(0.0, 1.0, (len(FEATURES), len(LADDER)))
+    weights[0] = 30.0
+    values = rng.normal(0.0, 1.0, (count, len(FEATURES)))
+    values[:, 0], values[:, 1] = 1.0, rng.random(count) > 0.5
+    errors = [ErrorRow(f"scene {i % 12}", value, value @ weights) for i, value in enumerate(values)]
+    seen = np.zeros(len(FEATURES))
+    seen[[FEATURES.index(name) for name in ("one", "pixels", "peels", "blur")]] = 2.0, 0.9, 0.3, 0.1
+    times = [TimeRow(value, np.exp(np.full(len(LADDER), value @ seen))) for value in values]
+    return errors, times, weights
+
+
+def test_a_fit_finds_what_measurements_follow() -> None:
+    errors, times, _ = rows(3, 2000)
+    fitted = fit_curves(errors, times, {})
+    value = errors[7].feature
+    assert fitted.errors(value) == pytest.approx(errors[7].db, abs=0.6)
+    assert fitted.copies(value) == pytest.approx(times[7].copies, rel=0.01)
+    assert (fitted.uncertainty_db < 0.6).all()
+    row = int(np.argmin(np.abs(TARGETS - 30.0)))
+    db = np.array([error.db for error in errors if error.feature[1]])
+    reached = db[(db >= 30.0).any(axis=1)]
+    assert fitted.kept["disc"][row] == pytest.approx((reached >= 30.0).mean(axis=0))
+    # Beyond what was measured the ends hold, except for the size of frames.
+    far = value.copy()
+    far[FEATURES.index("contrast")] = 99.0
+    assert fitted.errors(far) == pytest.approx(fitted.errors(np.minimum(far, fitted.high)))
+    far[FEATURES.index("pixels")] += 1.0
+    assert fitted.copies(far) == pytest.approx(fitted.copies(value) * math.exp(0.9), rel=0.02)
+
+
+def test_times_follow_no_colours() -> None:
+    _, times, _ = rows(4)
+    weights = fit_times(times)
+    for name in ("contrast", "lights", "luminance", "is_disc"):
+        assert not weights[FEATURES.index(name)].any()
+
+
+# Rendering
+
+
+def test_auto_renders_what_the_method_that_it_chose_does(device_info: DeviceInfo) -> None:
+    frame = noise_frame(64, 48, seed=5)
+    for lens in (Lens(0.03, 2.0), Lens(0.03, 2.0, aperture="gaussian")):
+        with warnings.catch_warnings(), Renderer("auto", device=device_info.index, max_error="22dB") as renderer:
+            warnings.simplefilter("ignore", BudgetWarning)
+            result = renderer.render(frame, lens)
+        choice = result.choice
+        assert choice is not None
+        with Renderer(choice.setting.method, device=device_info.index, **choice.setting.options) as renderer:
+            assert np.array_equal(result.image, renderer.render(frame, lens).image)
+
+
+def test_auto_keeps_to_one_setting_while_nothing_changes(device_info: DeviceInfo) -> None:
+    frame = noise_frame(48, 48, seed=6)
+    with warnings.catch_warnings(), Renderer("auto", device=device_info.index, max_error="25dB") as renderer:
+        warnings.simplefilter("ignore", BudgetWarning)
+        found = [renderer.render(frame, Lens(0.02, focus)).choice for focus in np.linspace(1.5, 1.6, 12)]
+    assert len({str(choice.setting) for choice in found if choice}) == 1
+
+
+def test_auto_overlaps_frames_and_counts_only_those_alone(device_info: DeviceInfo) -> None:
+    frame = noise_frame(48, 48, seed=7)
+    with warnings.catch_warnings(), Renderer("auto", device=device_info.index, max_ms=1e4) as renderer:
+        warnings.simplefilter("ignore", BudgetWarning)
+        pending = [renderer.render_async(frame, Lens(0.02, 2.0)) for _ in range(3)]
+        images = [one.result().image for one in pending]
+        assert all(np.array_equal(images[0], image) for image in images[1:])
+        assert renderer._automatic is not None and renderer._automatic.under_way == 0
+        assert renderer._automatic._chooser is not None and not renderer._automatic._chooser._ratios
+        renderer.render(frame, Lens(0.02, 2.0))
+        assert renderer._automatic._chooser._ratios
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"max_error": 30, "max_ms": 5}, {"layers": 4, "max_ms": 5}, {"max_error": "good"}]
+)
+def test_auto_refuses_what_makes_no_sense(options: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        Renderer("auto", **options)
+
+
+# Tuning
+
+
+def test_tuning_on_frames_is_found_by_renderers(
+    device_info: DeviceInfo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("CLDOF_CACHE", str(tmp_path / "new" / "folder"))
+    monkeypatch.chdir(tmp_path)
+    noise_frame(40, 32, seed=8).save("one.npz")
+    noise_frame(64, 56, layers=2, seed=9).save("two.npz")
+    index = str(device_info.index)
+    assert main(["tune", "one.npz", "two.npz", "--device", index]) == 0
+    found = load_curves(device_info.name, device_info.driver_version)
+    assert found.source["device"] == device_info.name and found.source["copy_ms"] > 0.0
+    assert str(cache_folder()) in capsys.readouterr().out
+    # Errors are the shipped ones, times its own: 600 us to 1 s for such frames on anything that runs tests.
+    assert np.allclose(found.error_db, shipped_curves().error_db, rtol=1e-4)
+    frame = noise_frame(40, 32, seed=8)
+    with Renderer(device=device_info.index) as renderer:
+        value = features(renderer.stats(frame), Lens(0.02, 2.0), frame.camera)
+        measured = frame_ms(renderer, frame, Lens(0.02, 2.0))
+    predicted = float(found.copies(value)[LADDER.index(Setting("layered"))]) * float(found.source["copy_ms"])
+    assert predicted == pytest.approx(measured, rel=20.0)
+
+
+def test_errors_are_measured_against_references(
+    device_info: DeviceInfo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    require_opengl()
+    monkeypatch.setenv("CLDOF_CACHE", str(tmp_path))
+    for name, value in {
+        "_ERROR_SIZES": (32,),
+        "_TIME_SIZES": (32, 48),
+        "_LENSES": 2,
+        "_FEWEST_VIEWS": 16,
+        "_MOST_VIEWS": 32,
+    }.items():
+        monkeypatch.setattr(f"cldof.tune.{name}", value)
+    found, path = tune(
+        device_info.index, errors=True, scene_names=["plane", "silhouettes"], rows=tmp_path / "rows.json"
+    )
+    assert path.exists() and Curves.from_json(path.read_text()).source == found.source
+    data = json.loads((tmp_path / "rows.json").read_text())
+    assert [row["scene"] for row in data["rows"]] == ["plane"] * 2 + ["silhouettes"] * 2
+    db = np.array([row["db"] for row in data["rows"]])
+    assert ((db > 15.0) & (db <= 50.0)).all()
+    # A blur of one image lacks what is hidden.
+    gather, layered = LADDER.index(Setting("gather", {"samples": 16})), LADDER.index(Setting("layered"))
+    assert db[2:, layered].mean() > db[2:, gather].mean() + 1.0
+
+
+def test_rows_are_kept_whole(tmp_path: Path) -> None:
+    errors, _, _ = rows(1, 5)
+    save_rows(errors, tmp_path / "rows.json")
+    data = json.loads((tmp_path / "rows.json").read_text())
+    assert len(data["rows"]) == 5 and data["settings"] == [str(one) for one in LADDER]
+    assert np.allclose(data["rows"][2]["db"], errors[2].db, atol=0.01)
+
+
+# The command line
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CLDOF_CACHE", str(tmp_path / "cache"))
+    noise_frame(40, 32, seed=8).save("frame.npz")
+    return tmp_path
+
+
+def test_the_command_line_reports_the_choice(
+    device_info: DeviceInfo, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base = ["render", "frame.npz", "--device", str(device_info.index), "--method", "auto", "--report", "r.json"]
+    assert main([*base, "-o", "a.npy", "--max-error", "20dB"]) == 0
+    out = capsys.readouterr().out
+    choice = json.loads(Path("r.json").read_text())["settings"]["choice"]
+    assert f"auto    {choice['method']}" in out and "expected" in out
+    assert main([*base, "-o", "a.npy", "--max-ms", "1e-3"]) == 0
+    assert "times too short" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "options, says",
+    [
+        (["--method", "auto"], "needs --max-error"),
+        (["--method", "auto", "--max-error", "30", "--max-ms", "3"], "one of both"),
+        (["--method", "auto", "--max-error", "30", "--layers", "3"], "leave out --layers"),
+        (["--method", "auto", "--max-error", "2"], "give dB"),
+        (["--max-ms", "3"], "for --method auto only"),
+    ],
+)
+def test_impossible_requests_are_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], says: str
+) -> None:
+    assert main(["render", "frame.npz", "-o", "a.png", *options]) == 2
+    assert says in capsys.readouterr().err
+    assert not (folder / "a.png").exists()
+
+
+def test_tune_refuses_what_it_cannot_do(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tune", "--rows", "r.json"]) == 2
+    assert "give both" in capsys.readouterr().err
+    assert main(["tune", "frame.npz", "--errors"]) == 2
+    assert "built-in scenes" in capsys.readouterr().err
+    assert replace(shipped_curves(), source={}).source == {}
