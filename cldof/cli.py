@@ -236,6 +236,11 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--sigma-step", metavar="PX", help="short for --option sigma_step=PX")
     how.add_argument("--no-cascade", action="store_true", help="short for --option cascade=false")
     how.add_argument("--engine", metavar="NAME", help="short for --option engine=NAME")
+    how.add_argument(
+        "--no-view-dependent",
+        action="store_true",
+        help="shade what is glossy as the lens centre sees it; short for --option view_dependent=false",
+    )
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -440,7 +445,10 @@ def _accumulated(
     peeler = stack.enter_context(DepthPeeler(camera.width, camera.height))
     preview, lens, remarks = _aimed(arguments, settings, peeler, scene, camera, watch)
     with watch.step(_ACCUMULATE) as progress:
-        reference = accumulate(peeler, scene, camera, lens, views, jitter=jitter, progress=progress)
+        reference = accumulate(
+            peeler, scene, camera, lens, views, jitter=jitter, progress=progress,
+            view_dependent=not arguments.no_view_dependent,
+        )  # fmt: skip
 
     def pinhole() -> NDArray[np.float32]:
         closed = dataclasses.replace(lens, aperture_radius_m=0.0)
@@ -450,7 +458,7 @@ def _accumulated(
     floor = facts["noise_floor_db"]
     if floor is not None:
         remarks.append(f"noise floor {floor:.1f} dB: the PSNR of this image against endlessly many views")
-    asked = {"views": views, "jitter": jitter, "seed": 0}
+    asked = {"views": views, "jitter": jitter, "seed": 0, "view_dependent": not arguments.no_view_dependent}
     shot = _Shot(preview, lens, camera, remarks, peeler.device)
     return shot, _Picture(reference.image, pinhole, asked, {"method": _ACCUMULATE, **facts}, [], None)
 
@@ -548,6 +556,8 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
     ]
     if arguments.no_cascade:
         pairs.append(("cascade", "false"))
+    if arguments.no_view_dependent:
+        pairs.append(("view_dependent", "false"))
     return parse_options(arguments.method, pairs)
 
 
@@ -637,7 +647,7 @@ def _capture(
     factor: int,
     watch: _Stopwatch,
 ) -> LayeredFrame:
-    """Layers that serve all lenses, with a guard band for the largest blur."""
+    """Layers that serve all lenses: a guard band for the largest blur, surfaces where the preview asks for them."""
     needed = math.ceil(max(_largest_coc_px(lens, camera, preview) for lens in lenses))
     guard = min(needed, math.ceil(_GUARD_SHARE * max(camera.width, camera.height)))
     if guard < needed:
@@ -649,7 +659,10 @@ def _capture(
     widest = max(lenses, key=lambda lens: lens.aperture_radius_m)
     large = camera.supersampled(factor)
     with watch.step("capture") as progress:
-        return peeler.peel(scene, large, layers=peels, lens=widest, guard_px=factor * guard, progress=progress)
+        surface = preview.is_glossy_through(widest)
+        return peeler.peel(
+            scene, large, layers=peels, lens=widest, guard_px=factor * guard, surface=surface, progress=progress
+        )
 
 
 def _aimed(
@@ -662,13 +675,16 @@ def _aimed(
     whole: bool = False,
 ) -> tuple[LayeredFrame, Lens, list[str]]:
     """A first look at the scene, and the lens that follows from it; ``whole`` looks at every pixel."""
+    from .method_options import shades_surfaces
+
+    surface = arguments.method != _ACCUMULATE and shades_surfaces(arguments.method, settings.options)
     with watch.step("preview"):
         # On a pixel the depth has to be that pixel's own; for anything else a fraction of them is enough.
         shrink = 1 if whole or arguments.focus_at else _PREVIEW_SHRINK
         small = dataclasses.replace(
             camera, width=math.ceil(camera.width / shrink), height=math.ceil(camera.height / shrink)
         )
-        preview = peeler.peel(scene, small, layers=_PREVIEW_LAYERS)
+        preview = peeler.peel(scene, small, layers=_PREVIEW_LAYERS, surface=surface)
     return preview, *_choose_lens(arguments, settings, preview, camera, scene)
 
 

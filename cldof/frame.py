@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from .camera import Camera
 from .errors import FrameError, OutputError
 from .files import atomic_write, parse_json, read_arrays
+from .lens import Lens
 from .lighting import Environment, Lighting
 
 __all__ = ["LayeredFrame"]
@@ -22,6 +23,9 @@ _FORMAT_VERSION = 1
 _SURFACE_CHANNELS = {"normal": 3, "albedo": 3, "specular": 3, "shininess": None}
 # What shading from elsewhere needs.
 _SHADING = ("normal", "specular", "shininess")
+# Highlights that turn by less than this share of their own width over the lens's radius count as those of the lens
+# centre. What is left out is of second order in it: below 1 % of a highlight.
+_LEAST_TURN = 0.1
 # Peels may repeat a depth (coplanar surfaces, sky behind sky) but never come nearer by more than rounding.
 _ORDER_TOLERANCE = 1e-6
 # Nearer than any surface; products of inverse depths with CoC coefficients and scales fit float32.
@@ -187,7 +191,7 @@ class LayeredFrame:
         """How far highlights turn for a step of 1 m sideways, over their own width: the most of all glossy slots.
 
         A lobe of GGX's width alpha stands half-way between light and eye, so it turns by half the angle that the eye
-        does. Times the aperture's radius it tells whether a lens sees any difference; 0 where nothing is glossy.
+        does. 0 where nothing is glossy.
         """
         if not self.is_glossy:
             return 0.0
@@ -195,6 +199,10 @@ class LayeredFrame:
             inverse_width = np.sqrt((self.surface["shininess"] + 2.0) / 2.0)
         turn = np.where((self.surface["specular"] > 0.0).any(axis=-1), inverse_width / self.depth, 0.0)
         return float(turn.max()) / 2.0
+
+    def is_glossy_through(self, lens: Lens) -> bool:
+        """Whether surfaces look different enough from the points of this lens that it shows."""
+        return self.lobe_turn_per_m * lens.aperture_radius_m > _LEAST_TURN
 
     @cached_property
     def inputs(self) -> dict[str, NDArray[np.float32]]:

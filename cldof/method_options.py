@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from .errors import InputError
 from .methods import METHODS
 
-__all__ = ["Option", "about", "options_of", "parse_options", "simulated_aperture"]
+__all__ = ["Option", "about", "options_of", "parse_options", "shades_surfaces", "simulated_aperture"]
 
 _TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 
@@ -64,6 +64,12 @@ def simulated_aperture(method: str) -> str | None:
     """The one aperture that a method simulates; None for a method that takes the lens's own."""
     shape: str | None = _method(method).simulated_aperture
     return shape
+
+
+def shades_surfaces(method: str, options: dict[str, Any]) -> bool:
+    """Whether a method with these options makes use of a frame's surface buffers."""
+    option = options_of(method).get("view_dependent")
+    return option is not None and bool(options.get("view_dependent", option.default))
 
 
 def parse_options(method: str, pairs: Iterable[tuple[str, str]]) -> dict[str, Any]:

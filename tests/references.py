@@ -28,14 +28,18 @@ class Judged(NamedTuple):
         return LayeredFrame(frame.color[:count], frame.depth[:count], frame.camera, guard_px=frame.guard_px)
 
 
-def judged(name: str, shape: str) -> Judged:
-    """A built-in scene and 128 views of it through a ``"disc"`` or ``"gaussian"`` lens; skips without OpenGL."""
+def judged(name: str, shape: str, view_dependent: bool = False) -> Judged:
+    """A built-in scene and 128 views of it through a ``"disc"`` or ``"gaussian"`` lens; skips without OpenGL.
+
+    With ``view_dependent`` views are shaded from their own points, and the frame has surface buffers. Without, they are
+    shaded from the lens centre: then the blur alone is judged.
+    """
     require_opengl()
-    return _judged(name, shape)
+    return _judged(name, shape, view_dependent)
 
 
 @cache
-def _judged(name: str, shape: str) -> Judged:
+def _judged(name: str, shape: str, view_dependent: bool) -> Judged:
     from cldof.capture.accumulate import accumulate
     from cldof.capture.peel import DepthPeeler
 
@@ -45,6 +49,8 @@ def _judged(name: str, shape: str) -> Judged:
     assert scene.focus_distance_m is not None
     lens = Lens(scene.aperture_radius_m, scene.focus_distance_m)
     with DepthPeeler(SIZE, SIZE) as peeler:
-        frame = peeler.peel(scene, camera, layers=6, lens=lens, guard_px=12)
-        reference = accumulate(peeler, scene, camera, lens, views=_VIEWS, shape=shape, noise_floor=False)
+        frame = peeler.peel(scene, camera, layers=6, lens=lens, guard_px=12, surface=view_dependent)
+        reference = accumulate(
+            peeler, scene, camera, lens, _VIEWS, shape, noise_floor=False, view_dependent=view_dependent
+        )
     return Judged(frame, lens, reference.image)

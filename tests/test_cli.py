@@ -278,7 +278,7 @@ def test_accumulates(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Mon
     out = capsys.readouterr().out
     assert "out.npy  40x30, accumulate, 8 views" in out and "noise floor" in out
     report = json.loads(Path("report.json").read_text())
-    assert report["settings"] == {"views": 8, "jitter": False, "seed": 0}
+    assert report["settings"] == {"views": 8, "jitter": False, "seed": 0, "view_dependent": True}
     assert report["lens"]["aperture"]["shape"] == "gaussian"
     assert report["device"] is None and report["capture_device"] and report["layers"] is None
     assert 15.0 < report["plan"]["noise_floor_db"] < 80.0
@@ -674,3 +674,34 @@ def test_focus_on_needs_a_scene_with_that_node(frame_file: str, capsys: pytest.C
     require_opengl()
     base = ["render", "floating", "-o", "x.png", "--size", "32x32"]
     assert "no node 'tree'; named are knot" in refused(capsys, *base, "--focus-on", "tree")
+
+
+def test_glossy_scenes_are_captured_with_their_surfaces(on_device: DeviceInfo) -> None:
+    """Only by a method that shades them, where the lens sees the difference, and unless told otherwise."""
+    require_opengl()
+    base = ["-o", "out.npy", "--size", "48x36", "--peels", "2", "--quiet", "--save-frame", "frame.npz"]
+    images = []
+    for scene, more, eyes, has_surface in (
+        ("mirrors", ["--method", "multiview"], 16, True),
+        ("mirrors", ["--method", "multiview", "--no-view-dependent"], 0, False),
+        ("mirrors", ["--method", "multiview", "--aperture-radius", "1e-4"], 0, False),
+        ("fence", ["--method", "multiview"], 0, False),
+        ("mirrors", [], None, False),
+    ):
+        assert main(["render", scene, *base, *more, "--report", "report.json"]) == 0
+        assert json.loads(Path("report.json").read_text())["plan"].get("eyes") == eyes
+        assert bool(LayeredFrame.load("frame.npz").surface) == has_surface
+        images.append(np.load("out.npy"))
+    assert np.abs(images[0] - images[1]).max() > 0.05
+
+
+def test_no_view_dependent_shading_for_methods_that_have_none(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", "fence", "-o", "out.png", "--method", "gather", "--no-view-dependent"]) == 2
+    assert "has no option 'view_dependent'" in capsys.readouterr().err
+
+
+def test_accumulates_as_the_centre_sees_it() -> None:
+    require_opengl()
+    base = ["render", "mirrors", "--method", "accumulate", "--views", "8", "--size", "40x30", "--quiet"]
+    assert main([*base, "-o", "own.npy"]) == 0 and main([*base, "-o", "centre.npy", "--no-view-dependent"]) == 0
+    assert np.abs(np.load("own.npy") - np.load("centre.npy")).max() > 0.05

@@ -68,7 +68,7 @@ class Case:
     ) -> None:
         self.key, self._peeler, self._cache, self._seed = key, peeler, cache, seed
         self._views, self._capture_runs = reference_views, capture_runs
-        self._frames: dict[tuple[int, int], tuple[LayeredFrame, Times]] = {}
+        self._frames: dict[tuple[int, int, bool], tuple[LayeredFrame, Times]] = {}
         self._references: dict[tuple[str, bool], tuple[Image, dict[str, Any]]] = {}
 
     @cached_property
@@ -88,7 +88,7 @@ class Case:
 
     @cached_property
     def _look(self) -> LayeredFrame:
-        return self._peeler.peel(self.scene, self.camera, layers=2)
+        return self._peeler.peel(self.scene, self.camera, layers=2, surface=True)
 
     @cached_property
     def guard_px(self) -> int:
@@ -102,22 +102,32 @@ class Case:
         c1, c0 = self.lens.coc_coefficients(self.camera)
         return max(abs(c1 * inverse + c0) for inverse in self._look.inverse_depth_range)
 
-    def frame(self, peels: int, supersample: int = 1) -> tuple[LayeredFrame, Times]:
-        """The captured layers and how long a capture takes, uploads to OpenGL left out."""
-        if (peels, supersample) not in self._frames:
+    def frame(self, peels: int, supersample: int = 1, surface: bool = False) -> tuple[LayeredFrame, Times]:
+        """The captured layers and how long a capture takes, uploads to OpenGL left out.
+
+        With ``surface`` they have surface buffers, if the scene is glossy.
+        """
+        surface = surface and self._look.is_glossy_through(self.lens)
+        key = peels, supersample, surface
+        if key not in self._frames:
             camera = dataclasses.replace(
                 self.camera, width=self.key.width * supersample, height=self.key.height * supersample
             )
 
             def capture() -> LayeredFrame:
                 return self._peeler.peel(
-                    self.scene, camera, layers=peels, lens=self.lens, guard_px=self.guard_px * supersample
+                    self.scene,
+                    camera,
+                    layers=peels,
+                    lens=self.lens,
+                    guard_px=self.guard_px * supersample,
+                    surface=surface,
                 )
 
             capture()
             frame, times = timed(capture, self._capture_runs)
-            self._frames[peels, supersample] = frame, times
-        return self._frames[peels, supersample]
+            self._frames[key] = frame, times
+        return self._frames[key]
 
     def accumulated(self, views: int, aperture: str, jitter: bool, seed: int) -> Reference:
         """Accumulate views as one pattern, without a noise floor, as somebody would who wants the picture."""

@@ -29,6 +29,7 @@ from ..frame import LayeredFrame
 from ..host.device import Device, DeviceInfo, list_devices
 from ..host.profile import copy_baseline
 from ..lens import Lens
+from ..method_options import shades_surfaces
 from ..metrics import compare
 from ..renderer import Renderer
 from . import ladders, peers
@@ -352,7 +353,7 @@ class _Bench:
         options = dict(rung.options)
         if rung.supersample != 1:
             options["supersample"] = rung.supersample
-        frame, capture = case.frame(rung.peels, rung.supersample)
+        frame, capture = case.frame(rung.peels, rung.supersample, shades_surfaces(job.method, options))
         size = (case.key.height, case.key.width)
         measured = measure(job.method, options, frame, case.lens, job.device.index, self.settings.runs, size)
         label = self.labels[job.device.index]

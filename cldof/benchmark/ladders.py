@@ -80,6 +80,8 @@ LADDERS: dict[str, tuple[Rung, ...]] = {
         Rung("64 rays, 8 peels", peels=8),
         Rung("64 rays, jitter", {"jitter": True}),
         Rung("64 rays, no cones", {"cone": False}),
+        Rung("64 rays, shaded from the centre", {"view_dependent": False}),
+        Rung("64 rays, shaded from 64 points", {"eyes": 64}),
     ),
     "lightfield": (
         Rung("16 views", {"views": 16}),

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import SceneError
 from . import hard_scenes
+from .glossy_scenes import mirrors
 from .scene import Ambient, DirectionalLight, Gradient, Material, Node, PointLight, Scene
 from .shapes import ball, block, knot, lathe, leaf, merge, moved, pipe, quad, ring, star
 from .staging import Light, aimed_camera, floor, glow, leaf_material, merged, mirrored, paint, plant, printed
@@ -45,6 +46,7 @@ def builtin_scenes() -> dict[str, BuiltinScene]:
         "tabletop": BuiltinScene("chess pieces at arm's length, shallow focus, bright HDR lamps far behind", _tabletop),
         "glass": BuiltinScene("a tinted glass pane between sculptures, prints on a far wall", _glass),
         "floating": BuiltinScene("shapes in mid-air over a transparent background", _floating),
+        "mirrors": BuiltinScene("polished metal in a hall: reflections that the lens blurs", mirrors, TEST),
         **{name: BuiltinScene(text, make, TEST) for name, (text, make) in hard_scenes.HARD_SCENES.items()},
     }
 

@@ -78,9 +78,6 @@ _STILL_PX = 0.499
 _BRIGHT_PX, _BRIGHT_RAYS = 1.5, 4
 # Rays per px^2 of the largest circle of confusion that a cell can see: more are not traced. Costs up to 0.2 dB.
 _RAYS_PER_PX2 = 1.0
-# Highlights that turn by less than this share of their own width over the lens's radius count as those of the lens
-# centre. What is left out is of second order in it: below 1 % of a highlight.
-_LEAST_TURN = 0.1
 # Pixels of the jitter pattern along x and y.
 _JITTER = 4
 
@@ -294,7 +291,7 @@ class Multiview:
             most = min(most, max(_FEWEST_LAYERS, _LAYER_BYTES // layer_bytes - 2))
         refined = self.supersample > 1 and most >= _FEWEST_TO_REFINE
         layers = _layers(near_px, far_px, self.delta_px or _USUAL_DELTA_PX, most, lens.aperture, refined)
-        if self.view_dependent and frame.lobe_turn_per_m * lens.aperture_radius_m > _LEAST_TURN:
+        if self.view_dependent and frame.is_glossy_through(lens):
             layers = layers._replace(eyes=min(self.eyes, self.rays))
         summary = {
             "method": self.name,
