@@ -377,6 +377,8 @@ def _render(arguments: argparse.Namespace) -> None:
             }
             with atomic_write(report) as stream:
                 stream.write(json.dumps(details, indent=2, allow_nan=False).encode() + b"\n")
+    if arguments.explain:
+        print(picture.explained)
     if not arguments.quiet:
         _summarise(output, facts, shot, watch, sum(timing.ms for timing in picture.timings))
 
@@ -397,6 +399,7 @@ class _Picture(NamedTuple):
     plan: Any
     timings: list[Any]
     device: str | None
+    explained: str = "Brute force: every view is rendered in full; there is nothing to plan."
 
 
 def _rendered(
@@ -427,7 +430,8 @@ def _rendered(
     if result.choice is not None:
         asked["choice"] = {**_plain(result.choice.to_dict()), "kernels_ms": sum(timing.ms for timing in result.timings)}
     device = str(renderer.device.info)
-    return shot, _Picture(result.image, pinhole, asked, result.plan.summary, result.timings, device)
+    plan = result.plan
+    return shot, _Picture(result.image, pinhole, asked, plan.to_dict(), result.timings, device, plan.explain())
 
 
 def _accumulated(

@@ -9,8 +9,9 @@ much that can change a pixel at most.
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Hashable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -44,6 +45,10 @@ _TAIL_USES = 6.0
 # Windows that are more of the frame than this are not worth it: cutting out and pasting is work, too.
 _LARGEST_SHARE = 0.75
 _MOST_WINDOWS = 4
+# Layers of one side of two, of all that a method with layers does.
+_SIDE_SAVING = 0.45
+# Copying the image, whatever else is left out.
+_LEAST_SHARE = 0.01
 # Windows begin and end at multiples of this, in px.
 _GRID = 64
 # Reaches are rounded up to these, in tiles.
@@ -233,15 +238,58 @@ class FramePlan(Plan):
     ----------
     decisions : tuple of Decision
     error_bound : float
-        All decisions together change no pixel by more than this, linear units.
+        All decisions together change no pixel by more than this, linear units. Holds for the frame that the statistics
+        are of.
+    share : float
+        Predicted work as a share of that for everything.
+    about : str
+        What is planned, in one line.
     """
 
     decisions: tuple[Decision, ...] = ()
     error_bound: float = 0.0
+    share: float = 1.0
+    about: str = ""
 
     def explain(self) -> str:
-        """The plan in words, for people."""
-        return "\n".join(f"{'kept' if one.kept else 'left out'}: {one.effect}: {one.reason}" for one in self.decisions)
+        """The plan in words, for people who have never seen the code."""
+        wide = max((len(one.effect) for one in self.decisions), default=0)
+        lines = [self.about, ""]
+        for one in self.decisions:
+            text = one.reason
+            if not one.kept:
+                change = f"changes a pixel by at most {one.error:.2g}" if one.error > 0.0 else "changes nothing"
+                saving = f", saves about {one.saving:.0%}" if one.saving >= 0.005 else ""
+                text += f" ({change}{saving})"
+            head = f"  {'needed  ' if one.kept else 'left out'}  {one.effect:<{wide}}  "
+            lines.append(textwrap.fill(text, 110, initial_indent=head, subsequent_indent=" " * len(head)))
+        lines.append("")
+        if self.error_bound > 0.0:
+            steps = self.error_bound * 255.0
+            lines.append(
+                f"No pixel differs from the full computation by more than {self.error_bound:.2g} in linear light "
+                f"({-20.0 * math.log10(self.error_bound):.0f} dB, {steps:.1f} of 255 steps)."
+            )
+        else:
+            lines.append("Every pixel is the same as in the full computation, but for rounding.")
+        if self.summary.get("statistics") == "last":
+            lines.append("Judged by the frame before: this holds as far as this frame looks the same.")
+        lines.append(f"Expected work: {self.share:.0%} of that for everything.")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for reports."""
+        decisions = [
+            {**{field.name: getattr(one, field.name) for field in fields(one)}, "error_db": one.error_db}
+            for one in self.decisions
+        ]
+        return {
+            "about": self.about,
+            "decisions": decisions,
+            "error_bound": self.error_bound,
+            "expected_share_of_work": self.share,
+            **self.summary,
+        }
 
 
 class Window(NamedTuple):
@@ -267,8 +315,14 @@ def everything(method: Method, frame: LayeredFrame, lens: Lens) -> FramePlan:
     """The plan that leaves nothing out."""
     widen = getattr(method, "plan_both_sides", method.plan)
     base = widen(frame, lens)
-    decisions = (Decision("everything", True, "planning is off"),)
-    return FramePlan(Layout(base.structure, frame.layer_count, None), base.params, dict(base.summary), decisions)
+    summary = {**base.summary, "error_bound": 0.0, "peels_used": frame.layer_count, "windows": None}
+    return FramePlan(
+        Layout(base.structure, frame.layer_count, None),
+        base.params,
+        summary,
+        (Decision("everything", True, "planning is off"),),
+        about=f"{method.name}: {frame!r}",
+    )
 
 
 def plan_frame(
@@ -325,6 +379,7 @@ class _Planner:
         self.slack_px = 4e-7 * (abs(self.c1) * largest + abs(self.c0))
 
     def plan(self) -> FramePlan:
+        """Everything decided."""
         decisions = list(self._sides())
         windows, focus = self._in_focus()
         decisions.append(focus)
@@ -340,9 +395,48 @@ class _Planner:
                 params = {}
             for number, window in enumerate(windows):
                 params[f"window_{number}"] = struct_scalar(_WINDOW, window.x, window.y, *window.inner)
-        summary = {**self.base.summary, "error_bound": bound, "peels_used": peels, "windows": sizes}
+        summary = {
+            **self.base.summary,
+            "error_bound": bound,
+            "peels_used": peels if windows != () else 0,
+            "windows": sizes,
+            "scene": self.stats.summary(),
+        }
         inner = self.base.structure if windows is None or windows else None
-        return FramePlan(Layout(inner, peels, sizes), params, summary, tuple(decisions), bound)
+        share = 1.0
+        for one in decisions:
+            share *= 1.0 if one.kept else 1.0 - one.saving
+        return FramePlan(
+            Layout(inner, peels, sizes),
+            params,
+            summary,
+            tuple(decisions),
+            bound,
+            max(share, _LEAST_SHARE),
+            self._about(),
+        )
+
+    def _about(self) -> str:
+        shape = self.shape
+        low, high = self.seen
+        nearest, farthest = (float(v[np.isfinite(v)].max(initial=0.0)) for v in (-low, high))
+        blur = []
+        if nearest > _NEGLIGIBLE_PX:
+            blur.append(f"up to {nearest:.1f} px in front of it")
+        if farthest > _NEGLIGIBLE_PX:
+            blur.append(f"up to {farthest:.1f} px behind it")
+        distance = -self.c0 / self.c1 if self.c1 else math.nan
+        focus = (
+            "a pinhole"
+            if not self.c1
+            else f"focus at {1.0 / distance:.3g} m"
+            if distance > 0.0
+            else "focus at infinity"
+        )
+        return (
+            f"{self.method.name}: {shape.width}x{shape.height} px, {_count(shape.layers, 'peel')}; {focus}; "
+            f"blur radius {' and '.join(blur) or 'nowhere above 0'}"
+        )
 
     # --- sides ---
 
@@ -377,6 +471,7 @@ class _Planner:
         coc = self.c1 * (stats.bin_edges[1:] + stats.bin_edges[:-1]) / 2.0 + self.c0
         visible = max(float(stats.histogram[0].sum()), 1.0)
         low, high = self.seen
+        sided = "focus_layer" in self.base.summary or "first_sub_image" in self.base.summary
         ends = (("near side", low, coc < 0.0, "in front of"), ("far side", high, coc > 0.0, "behind"))
         for name, extreme, side, where in ends:
             extreme = extreme[np.isfinite(extreme)]
@@ -387,36 +482,38 @@ class _Planner:
                 reason = (
                     f"up to {reach:.1f} px of blur {where} the focus; {share:.0%} of the picture has over half a pixel"
                 )
+            elif reach > 0.0:
+                reason = f"nothing {where} the focus is blurred by more than {reach:.1g} px"
             else:
-                reason = f"nothing {where} the focus is blurred by more than {reach:.2g} px"
-            yield Decision(name, kept, reason, saving=0.0 if kept else 0.5)
+                reason = f"nothing {where} the focus is blurred"
+            yield Decision(name, kept, reason, saving=0.0 if kept or not sided else _SIDE_SAVING)
 
     # --- tiles ---
 
     def _in_focus(self) -> tuple[tuple[Window, ...] | None, Decision]:
         """The parts of the frame that have to be computed, None for all of it."""
         name = "tiles in focus"
+        if self.c1 == 0.0:
+            return (), Decision(name, False, "a pinhole blurs nothing: its image is copied", 0.0, 1.0)
         if self.locality is None:
-            return None, Decision(name, True, "with these options the method's pixels depend on their place")
+            return None, Decision("whole frame", True, "what a pixel shows depends on its place in the image")
         bound = self._bounds()
         allowed = self.max_change / 2.0
         active = bound > allowed
         share = float((active * self.stats.pixels).sum() / self.stats.pixels.sum())
         error = float(bound[~active].max(initial=0.0))
         if not active.any():
-            reason = f"all {active.size} tiles of {TILE} x {TILE} px show what a pinhole sees"
+            reason = f"all {active.size} tiles of {TILE} x {TILE} px show what a pinhole sees: they are copied"
             return (), Decision(name, False, reason, error, 1.0)
         full = self.shape.width * self.shape.height
         windows = self._windows(active)
         area = sum(window.width * window.height for window in windows)
         if area > _LARGEST_SHARE * full:
-            reason = (
-                f"{share:.0%} of the tiles are blurred or within reach of a blur; with what they depend on, too many"
-            )
-            return None, Decision(name, True, reason)
+            reason = f"{share:.0%} of the tiles are blurred or within reach of a blur, too many to treat by themselves"
+            return None, Decision("whole frame", True, reason)
         if not self._may_cut(windows):
-            reason = "what is hidden has to be guessed from all around, so the frame is not taken apart"
-            return None, Decision(name, True, reason)
+            reason = f"{share:.0%} of the tiles are blurred, but what they hide has to be guessed from all around"
+            return None, Decision("whole frame", True, reason)
         if self.locality.tail > 0.0:
             error += _TAIL_USES * self.locality.tail * self.contrast
         parts = f"{len(windows)} window{'s' if len(windows) > 1 else ''} of {area / full:.0%} of the frame"
@@ -551,11 +648,81 @@ class _Planner:
 
     # --- what only the method knows ---
 
-    def _of_the_method(self, windows: tuple[Window, ...] | None) -> list[Decision]:
-        explain = getattr(self.method, "explain", None)
-        if explain is None or windows == ():
-            return []
-        return [Decision(*entry) for entry in explain(self.base)]
+    def _of_the_method(self, windows: tuple[Window, ...] | None) -> Iterator[Decision]:
+        """What the method's own plan says."""
+        if windows == ():
+            return
+        says = self.base.summary
+        largest = max(float(np.abs(v[np.isfinite(v)]).max(initial=0.0)) for v in self.seen)
+        if says.get("focus_layer") is not None and says.get("sigma_step") is not None:
+            total, step = says["layers"], says["sigma_step"]
+            yield Decision("depth layers", True, f"{total} of at most 32, the blur growing by {step:.2g} px a layer")
+            yield from self._empty_layers(total)
+        if "first_sub_image" in says:
+            first, last = says["first_sub_image"], says["last_sub_image"]
+            yield Decision(
+                "sub-images", True, f"{_count(last - first + 1, 'sub-image')}, {-first} in front, {last} behind"
+            )
+            yield self._disocclusion(windows)
+        if "mip_levels" in says:
+            levels = says["mip_levels"]
+            reason = (
+                f"{_count(levels, 'level')} for blurs of {largest:.1f} px"
+                if levels
+                else (
+                    f"with {_count(says['views'], 'view')}, rays stand closer than pixels at blurs of {largest:.1f} px"
+                )
+            )
+            yield Decision("coarser images (mips)", levels > 0, reason)
+        if "cone" in says and "rays" in says:
+            room = math.sqrt(math.pi * max(largest, 1e-6) ** 2 / says["rays"])
+            reason = f"{says['rays']} rays stand up to {room:.1f} px apart"
+            yield Decision(
+                "thick rays (cones)", room > 1.0, reason + ("" if room > 1.0 else ", no more than pixels do")
+            )
+        if "rays" in says:
+            fewer = ", fewer where all that a cell of 16 x 16 px can see is little blurred" if says["adaptive"] else ""
+            yield Decision("rays", True, f"up to {says['rays']} a pixel{fewer}")
+        if "jitter" in says:
+            reason = "asked for" if says["jitter"] else "thick rays leave no pattern to hide; jitter=True asks for it"
+            yield Decision("jitter", bool(says["jitter"]), reason)
+        if "samples" in says:
+            yield Decision(
+                "samples", True, f"{says['samples']} per blurred pixel, 1 where the blur is below half a pixel"
+            )
+        if "eyes" in says:
+            if says["eyes"]:
+                reason = f"glossy surfaces are shaded from {_count(says['eyes'], 'point')} of the lens"
+            elif self.shape.is_glossy:
+                reason = "highlights turn by less over the lens than can be seen"
+            else:
+                reason = "nothing is glossy: all surfaces look the same from all of the lens"
+            yield Decision("view-dependent light", says["eyes"] > 0, reason)
+
+    def _empty_layers(self, total: int) -> Iterator[Decision]:
+        """How many depth layers nothing lies in."""
+        edges = np.sort(self.c1 * self.stats.bin_edges + self.c0)
+        coc = np.array(self.base.summary["layer_coc_px"])
+        used = self.stats.occupied[::-1] if self.c1 < 0.0 else self.stats.occupied
+        empty = 0
+        for k in range(total):
+            low = coc[k - 1] if k > 0 else -np.inf
+            high = coc[k + 1] if k + 1 < total else np.inf
+            low = coc[k - 2] if k > 1 else low  # surfaces that slope into a layer enter it early
+            empty += not bool((used & (edges[1:] >= low) & (edges[:-1] <= high)).any())
+        if empty:
+            reason = f"{empty} of {total} hold nothing, but their blur steps belong to the layers beyond them"
+            yield Decision("empty depth layers", True, reason)
+
+    def _disocclusion(self, windows: tuple[Window, ...] | None) -> Decision:
+        stats = self.stats
+        limit = self.locality.guesses_nearer_than_px if self.locality is not None else math.inf
+        farther = np.where(stats.is_closed, self._coc(np.maximum(stats.nearest, 0.0)), -np.inf).max(axis=0)
+        guessed = float(((farther < limit) * stats.pixels).sum() / stats.pixels.sum())
+        reason = f"in {guessed:.0%} of the tiles something may be missing behind what is taken away"
+        if not guessed:
+            reason = "a peel stands behind all that is taken away; only what lies beyond the frame's edges is guessed"
+        return Decision("disocclusion", True, reason)
 
 
 def planned_program(method: Method, shape: FrameShape, plan: FramePlan, traits: Traits) -> FrameProgram:
@@ -650,6 +817,10 @@ def _input_layout(
     if name == "inv_depth":
         return (pitch, part_pitch), 1, EMPTY
     return (width, part_width), {"color": 4, "normal": 3, "albedo": 3}.get(name, 1), 0.0
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _tiles_of(window: Window) -> tuple[slice, slice]:

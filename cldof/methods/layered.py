@@ -206,6 +206,7 @@ class Layered:
             "layers": stack.total,
             "focus_layer": stack.front,
             "sigma_step": stack.sigma_step,
+            "layer_coc_px": coc.tolist(),
             "largest_near_coc_px": near_px,
             "largest_far_coc_px": far_px,
         }

@@ -175,10 +175,13 @@ class LightField:
         return Plan(Views(count, lens.aperture, levels), {"lens": params[()]}, summary)
 
     def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality | None:
-        """Slots move by their CoC. Random pixels depend on their place in the image, so then nothing can be said."""
+        """Slots move by their CoC.
+
+        Random pixels depend on their place in the image, and panes before the void are not what a pinhole sees.
+        """
         views = plan.structure
         assert isinstance(views, Views)
-        if self.lookup == "jitter":
+        if self.lookup == "jitter" or (shape.has_glass and not shape.is_opaque):
             return None
         mips = 4 * 2**views.levels if views.levels else 0
         step = 1.0 / 512.0  # slots that move by less stay where they are

@@ -223,7 +223,7 @@ class Pyramid:
             reach_px,
             leak,
             # The farthest sub-image culls most.
-            guesses_nearer_than_px=self._radius(chosen.last - 2) / GAUSSIAN_SIGMA
+            guesses_nearer_than_px=self._radius(chosen.last - 1) / GAUSSIAN_SIGMA
             if self.hidden == "peels" and self.normalise
             else math.inf,
         )
