@@ -121,6 +121,9 @@ def _parser() -> argparse.ArgumentParser:
     more.add_argument("--pinhole", metavar="FILE", help="also save the image without any blur")
     more.add_argument("--save-frame", metavar="FILE", help="also save the captured layers (.npz), to render again")
     more.add_argument("--report", metavar="FILE", help="also save lens, camera, device, plan and times as JSON")
+    more.add_argument(
+        "--explain", action="store_true", help="print what was computed, what was left out, why, and what that changes"
+    )
     more.add_argument("--quiet", action="store_true", help="print errors only")
 
     sequence = commands.add_parser(

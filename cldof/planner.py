@@ -500,6 +500,8 @@ class _Planner:
         bound = self._bounds()
         allowed = self.max_change / 2.0
         active = bound > allowed
+        if self.locality.rim_px:
+            active = _spread(active, math.ceil(self.locality.rim_px / TILE)) > 0.0
         share = float((active * self.stats.pixels).sum() / self.stats.pixels.sum())
         error = float(bound[~active].max(initial=0.0))
         if not active.any():
@@ -564,6 +566,13 @@ class _Planner:
         limit = self.locality.guesses_nearer_than_px if self.locality is not None else -math.inf
         if limit == -math.inf:
             return True
+        shape, edge = self.shape, self.locality.guesses_at_edges_px if self.locality is not None else 0.0
+        for window in windows:
+            x0, y0, x1, y1 = window.inner
+            x0, y0 = max(x0, shape.guard_px), max(y0, shape.guard_px)
+            x1, y1 = min(x1, shape.width - shape.guard_px), min(y1, shape.height - shape.guard_px)
+            if min(x0, y0, shape.width - x1, shape.height - y1) < edge:
+                return False
         # A closed peel that is far enough is not culled, and then there is nothing to guess.
         farther = np.where(self.stats.is_closed, self._coc(np.maximum(self.stats.nearest, 0.0)), -np.inf)
         known = farther.max(axis=0) >= limit + self.slack_px

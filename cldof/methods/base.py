@@ -116,9 +116,13 @@ class Locality:
         A surface hides what is behind it where its CoC changes by no more than this from one pixel to the next.
     counts_slopes : bool
         Whether a slot reaches as far in depth as its neighbours, as to ``leak``.
+    rim_px : int
+        So far beside a blur, also one behind, pixels in focus are not exactly the pinhole's.
     guesses_nearer_than_px : float
         Where all that a column of pixels holds has a signed CoC below this, the method guesses what is behind it from
         all around; such places are not taken apart. -inf: it never guesses.
+    guesses_at_edges_px : float
+        So near to the edges of the frame (not of the image) it guesses, too.
     """
 
     align_px: int
@@ -129,7 +133,9 @@ class Locality:
     tail: float = 0.0
     closed_step_px: float = 0.0
     counts_slopes: bool = False
+    rim_px: int = 0
     guesses_nearer_than_px: float = -math.inf
+    guesses_at_edges_px: float = 0.0
 
 
 class Method(Protocol):

@@ -177,11 +177,12 @@ class LightField:
     def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality | None:
         """Slots move by their CoC.
 
-        Random pixels depend on their place in the image, and panes before the void are not what a pinhole sees.
+        Random pixels depend on their place in the image, and panes in focus, or what
+        is in focus before the void, are not quite what a pinhole sees.
         """
         views = plan.structure
         assert isinstance(views, Views)
-        if self.lookup == "jitter" or (shape.has_glass and not shape.is_opaque):
+        if self.lookup == "jitter" or shape.has_glass or not shape.is_opaque:
             return None
         mips = 4 * 2**views.levels if views.levels else 0
         step = 1.0 / 512.0  # slots that move by less stay where they are
@@ -189,6 +190,7 @@ class LightField:
             align_px=max(64, 2**views.levels),
             margin_px=int(plan.params["lens"]["reach"]) + mips + 2 * _TILE,
             reach_px=lambda coc: coc + _FOOTPRINT_PX + mips,
+            rim_px=1,  # rays take their samples all over a pixel, and interpolate
             leak=lambda coc: np.where(coc < step, 2.0 * coc, np.minimum(3.0 * coc + 2.0 / views.total, 1.0)),
         )
 

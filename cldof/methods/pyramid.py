@@ -215,17 +215,19 @@ class Pyramid:
             share = 2.0 * GAUSSIAN_SIGMA * coc_px / sigmas[1] if self.matting == "seamless" else np.ones_like(coc_px)
             return np.minimum(share, 1.0)
 
-        # What lies beyond the frame's edges is always a hole, as wide as the margin; pulling and pushing fills a hole
-        # from at most six times its width.
         return Locality(
             max(64, 2**steps),
-            8 * 2**steps + _MARGIN,
+            4 * 2**steps + _MARGIN,
             reach_px,
             leak,
             # The farthest sub-image culls most.
-            guesses_nearer_than_px=self._radius(chosen.last - 1) / GAUSSIAN_SIGMA
-            if self.hidden == "peels" and self.normalise
-            else math.inf,
+            guesses_nearer_than_px=(
+                self._radius(chosen.last - 1) / GAUSSIAN_SIGMA
+                if self.hidden == "peels" and self.normalise
+                else math.inf
+            ),
+            # What lies beyond is a hole, filled from as far as the levels of the pyramid happen to reach.
+            guesses_at_edges_px=4.0 * 2**steps + 2.0,
         )
 
     def _radius(self, i: int) -> float:
