@@ -17,6 +17,7 @@ ROOT = Path(__file__).parent.parent
 ARGUMENTS = {
     "render_npz": ["image.png", "--size", "96"],
     "render_scene": ["image.png", "--size", "96", "--scene", "floating"],
+    "glossy": ["image.png", "--size", "96"],
     "loop": ["--size", "96", "--frames", "4"],
     "rack_focus": [".", "--size", "96", "--frames", "4"],
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import struct
@@ -176,6 +177,7 @@ def _claim(directory: Path) -> Path:
             lock.close()
             continue
         _claimed[candidate] = lock
+        atexit.register(lock.close)  # an open file at the end of a process is a warning
         return candidate
     return directory
 
