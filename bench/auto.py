@@ -4,9 +4,10 @@
     python -m bench auto --busy         # processor time in place of the clock, for a machine with other work
 
 Errors: 14 built-in scenes x 12 lenses (focus near, on the scene's subject and far; two apertures; disc and Gaussian) at
-192x192, each against its own accumulated reference. What is judged is never what was fitted: for every scene the error
-model is made anew from the tuning measurements of the other 13 (bench/results/auto-tuning.json, with other lenses and
-sizes); only the device's times come from the run itself, by a fit that leaves out the same scene.
+192x192, each against its own accumulated reference. What is judged is never what was fitted: the measurements in
+bench/results/auto-tuning.json are of other lenses and sizes. There are two tables: with what `cldof tune` fits, and
+with models that for every scene are made anew from the other 13, as for a scene that nobody has measured. The device's
+times come from the run itself, always by a fit that leaves out the scene.
 
 Times: frames of 512x512 of every scene, by a renderer of its own for each budget.
 """
@@ -144,13 +145,13 @@ def error_table(cases: list[Case], picks: dict[int, list[int]], which: str) -> l
     return lines
 
 
-def judge_errors(cases: list[Case], unit_ms: float) -> list[str]:
-    """The table for max_error."""
+def judge_errors(cases: list[Case], unit_ms: float, left_out: bool) -> list[str]:
+    """The table for max_error; with ``left_out`` no scene is known to the models that it is judged by."""
     tuning = tuning_rows()
     picks: dict[int, list[int]] = {target: [0] * len(cases) for target in TARGETS_DB}
     for scene in dict.fromkeys(case.scene for case in cases):
         times = [TimeRow(case.feature, case.ms / unit_ms) for case in cases if case.scene != scene]
-        curves = fit_curves([row for row in tuning if row.scene != scene], times, {})
+        curves = fit_curves([row for row in tuning if not left_out or row.scene != scene], times, {})
         for index, case in enumerate(cases):
             if case.scene == scene:
                 for target in TARGETS_DB:
@@ -165,9 +166,8 @@ def judge_errors(cases: list[Case], unit_ms: float) -> list[str]:
     return lines
 
 
-def judge_times(device: Any, busy: bool, unit_ms: float, cases: list[Case], scenes: tuple[str, ...]) -> list[str]:
+def judge_times(device: Any, busy: bool, unit_ms: float, scenes: tuple[str, ...]) -> list[str]:
     """The table for max_ms: the first choice alone, and after ten frames that it learns from."""
-    del cases
     lines = [
         "| max_ms, copies | attainable | kept, first choice | kept, after 10 frames | mean share of the time used |",
         "|---|---|---|---|---|",
@@ -231,6 +231,9 @@ def report(device: Any = None, busy: bool = False, scenes: tuple[str, ...] = SCE
         [TimeRow(case.feature, case.ms / unit) for case in cases]
     )
     print(f"\nTimes follow their model within {math.sqrt(float(((spread - fitted) ** 2).mean())):.0%} (RMS).\n")
-    print("\n".join(judge_errors(cases, unit)))
-    print()
-    print("\n".join(judge_times(device, busy, unit, cases, scenes)))
+    print("Scenes that are known, through other lenses:\n")
+    print("\n".join(judge_errors(cases, unit, left_out=False)))
+    print("\nScenes that are not known:\n")
+    print("\n".join(judge_errors(cases, unit, left_out=True)))
+    print("\nmax_ms:\n")
+    print("\n".join(judge_times(device, busy, unit, scenes)))

@@ -450,9 +450,9 @@ def curves_name(device: str, driver: str) -> str:
     return f"curves-{plain}-{key}.json"
 
 
-# Settings that kept an error in this share of the tuning cases (or in nearly as many as the best did) are trusted with
-# it, unless the prediction is this much too low.
-_TRUSTED, _NEARLY, _DISTRUST_DB = 0.97, 0.02, 1.0
+# Of the settings that kept an error in most tuning cases, those are trusted with it that kept it as often as the best
+# buy, where one case more in a hundred is worth 1.3 times the time; unless the prediction is this much too low.
+_WORTH, _LEAST_TRUSTED, _DISTRUST_DB = 100.0 * math.log(1.3), 0.9, 0.0
 # Others are taken when they are expected to do better by so many of their uncertainties: a cheaper one in place of a
 # trusted one, and any where none is trusted.
 _DOWNGRADE, _MARGIN = 1.5, 1.0
@@ -557,18 +557,19 @@ class Chooser:
     def _cheapest_for_error(self, feature: Vector, errors: Vector, times: Vector) -> tuple[int, str]:
         target = self.budget.min_db
         assert target is not None
-        trusted = self._trusted(feature, errors, _DISTRUST_DB)
+        trusted = self._trusted(feature, errors, times, _DISTRUST_DB)
         spare = (_DOWNGRADE if trusted.any() else _MARGIN) * self.curves.uncertainty_db
         good = np.flatnonzero(trusted | (errors >= target + spare))
         if good.size:
             return int(good[times[good].argmin()]), f"the cheapest of {good.size} settings for this error"
         return _nearly_best(np.arange(len(errors)), errors, times), "the least error there is"
 
-    def _trusted(self, feature: Vector, errors: Vector, distrust_db: float) -> NDArray[np.bool_]:
+    def _trusted(self, feature: Vector, errors: Vector, times: Vector, distrust_db: float) -> NDArray[np.bool_]:
         target = self.budget.min_db
         assert target is not None
         kept = self.curves.share_kept(feature, target)
-        return np.asarray((kept >= min(_TRUSTED, kept.max() - _NEARLY)) & (errors >= target - distrust_db) & (kept > 0))
+        best_buy = kept[np.argmin(np.log(times) - _WORTH * kept)]
+        return np.asarray((kept >= max(best_buy, _LEAST_TRUSTED)) & (errors >= target - distrust_db))
 
     def _headroom(self) -> float:
         return _LATER_HEADROOM if self._ratios else _HEADROOM
@@ -578,7 +579,7 @@ class Chooser:
         if self.budget.max_ms is not None:
             return bool(times[index] <= self.budget.max_ms)
         assert self.budget.min_db is not None
-        is_trusted = self._trusted(feature, errors, _DISTRUST_DB + _LENIENCE_DB)[index]
+        is_trusted = self._trusted(feature, errors, times, _DISTRUST_DB + _LENIENCE_DB)[index]
         spare = _MARGIN * self.curves.uncertainty_db[index]
         return bool(is_trusted or errors[index] >= self.budget.min_db + spare - _LENIENCE_DB)
 

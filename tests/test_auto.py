@@ -149,8 +149,15 @@ def test_features_are_numbers_for_anything(opaque: bool, device: Device) -> None
 def test_the_cheapest_trusted_setting_is_taken_for_an_error() -> None:
     given = curves([25, 40, 33, 45], [1, 4, 2, 9], kept=[0.5, 1.0, 0.98, 1.0])
     assert first(given, Budget.of("30dB")) == SETTINGS[2]
-    # Predicted 1 dB too low and more, it is not trusted any longer.
-    assert first(curves([25, 40, 28.9, 45], [1, 4, 2, 9], kept=[0.5, 1.0, 0.98, 1.0]), Budget.of("30dB")) == SETTINGS[1]
+    # Where less than that is expected, it is not trusted any longer.
+    assert first(curves([25, 40, 29.9, 45], [1, 4, 2, 9], kept=[0.5, 1.0, 0.98, 1.0]), Budget.of("30dB")) == SETTINGS[1]
+
+
+def test_some_cases_more_are_not_worth_any_time() -> None:
+    # 4 % more are worth 1.3 ** 4 = 2.9 times the time.
+    shares = [0.1, 0.1, 0.95, 0.99]
+    assert first(curves([31, 31, 31, 31], [1, 4, 2, 5.5], kept=shares), Budget.of("30dB")) == SETTINGS[3]
+    assert first(curves([31, 31, 31, 31], [1, 4, 2, 5.9], kept=shares), Budget.of("30dB")) == SETTINGS[2]
 
 
 def test_an_untrusted_setting_is_taken_when_it_is_expected_to_do_much_better() -> None:
