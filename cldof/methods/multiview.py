@@ -78,8 +78,9 @@ _STILL_PX = 0.499
 _BRIGHT_PX, _BRIGHT_RAYS = 1.5, 4
 # Rays per px^2 of the largest circle of confusion that a cell can see: more are not traced. Costs up to 0.2 dB.
 _RAYS_PER_PX2 = 1.0
-# Pixels of the jitter pattern along x and y.
+# Pixels of the jitter pattern along x and y, and the order in which Bayer 1973 fills the pattern: row by row.
 _JITTER = 4
+_BAYER = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
 
 _SIZE = np.dtype([(n, np.int32) for n in ("width", "height", "pitch", "peels", "layers", "cells_x", "cells_y")])
 _STEPS = np.dtype([(n, np.float32) for n in ("fine", "coarse", "turn", "front")])
@@ -427,14 +428,14 @@ def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
     first = 0
     for count in counts:
         for pattern in range(patterns):
-            on_lens = layers.aperture.samples(count, method.seed * patterns + pattern)
+            on_lens = _on_lens(method, layers.aperture, count, pattern)
             order, sizes = _grouped(on_lens, groups)
             ends = first + np.cumsum(sizes)
             ranges.append(np.stack([ends - sizes, sizes], axis=1))
             # The ray through lens point v meets C at p + C * (-v.x, v.y), y down.
             points.append(on_lens[order] * (-1.0, 1.0))
             first += count
-    on_lens = layers.aperture.samples(method.rays, method.seed * patterns)
+    on_lens = _on_lens(method, layers.aperture, method.rays, 0)
     order, sizes = _grouped(on_lens, groups)
     eyes = np.array([part.mean(axis=0) for part in np.split(on_lens[order], np.cumsum(sizes)[:-1])])
     blur = np.abs(layers.coc)
@@ -445,6 +446,20 @@ def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
     needs[blur >= _BRIGHT_PX, 1] = len(counts) - 1
     stacked = np.stack(ranges, axis=1).astype(np.int32)
     return RaySets(stacked, np.concatenate(points).astype(np.float32), needs.astype(np.int32), eyes)
+
+
+def _on_lens(method: Multiview, aperture: Aperture, count: int, pattern: int) -> NDArray[np.float64]:
+    """Lens samples of one set; with jitter those of one of 16 pixels.
+
+    All sets of a block are shifted lattices whose shifts are a lattice themselves: together they fill the lens evenly,
+    as sixteen times as many samples would, and pixels that are close to each other differ most.
+    """
+    if not method.jitter:
+        return aperture.samples(count, method.seed)
+    index, golden = np.arange(count), (math.sqrt(5.0) - 1.0) / 2.0
+    number, start = _BAYER[pattern], np.random.default_rng(method.seed).random(2)
+    across, around = (start[0] + number / 16.0) % 1.0, (start[1] + 7.0 * number / 16.0) % 1.0
+    return aperture.place((index + across) / count, (index * golden + around) % 1.0)
 
 
 def _grouped(points: NDArray[np.float64], groups: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

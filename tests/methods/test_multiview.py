@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
 
 from cldof import Camera, InputError, LayeredFrame, Lens
 from cldof.host.device import Device
@@ -402,6 +403,52 @@ def test_random_frames_keep_the_promises(
     assert (out[..., 3] <= 1.0).all()
     if opaque:
         np.testing.assert_allclose(out[..., 3], 1.0, atol=1e-6)
+
+
+def smooth_wall(depth: float, size: tuple[int, int] = (160, 120)) -> LayeredFrame:
+    """Patches of a few pixels in random colours, behind a comb that is in focus."""
+    rng = np.random.default_rng(4)
+    width, height = size
+    color = np.ones((2, height, width, 4), np.float32)
+    color[1, ..., :3] = rng.random((height // 4, width // 4, 3)).repeat(4, 0).repeat(4, 1)
+    color[0, ..., :3] = 0.2
+    color[0, :, np.arange(width) % 40 >= 8] = 0.0
+    z = np.full((2, height, width), 2.0, np.float32)
+    z[1] = depth
+    z[0][color[0, ..., 3] == 0.0] = np.inf
+    # What is first comes first.
+    gap = color[0, ..., 3] == 0.0
+    color[0][gap], z[0][gap] = color[1][gap], z[1][gap]
+    return LayeredFrame(color, z, Camera(width, height, 40.0))
+
+
+def squared_error(image: np.ndarray, exact: np.ndarray, seen_from_px: float = 0.0) -> float:
+    difference = (image - exact)[20:-20, 20:-20, :3].astype(np.float64)
+    if seen_from_px:
+        difference = gaussian_filter(difference, (seen_from_px, seen_from_px, 0.0))
+    return float(np.square(difference).mean())
+
+
+def test_jitter_turns_copies_of_edges_into_noise(device: Device) -> None:
+    """Seen from where pixels blend, 32 jittered cones are as good as 64 that are the same in every pixel."""
+    frame = smooth_wall(9.0)
+    lens = Lens(30.0 / frame.camera.focal_px, 2.0)
+    exact = render(device, frame, lens, rays=1024, cone=False)
+    errors = {
+        (rays, jitter): squared_error(render(device, frame, lens, rays=rays, jitter=jitter), exact, 1.5)
+        for rays, jitter in ((32, True), (32, False), (64, False))
+    }
+    assert errors[32, True] <= errors[64, False]
+    assert errors[32, True] <= 0.7 * errors[32, False]
+
+
+@pytest.mark.parametrize("rays", [8, 16])
+def test_cones_gain_two_decibels_on_strong_blur(device: Device, rays: int) -> None:
+    frame = smooth_wall(9.0)
+    lens = Lens(40.0 / frame.camera.focal_px, 2.0)
+    exact = render(device, frame, lens, rays=1024, cone=False)
+    cone, ray = (squared_error(render(device, frame, lens, rays=rays, cone=cone), exact) for cone in (True, False))
+    assert 10.0 * math.log10(ray / cone) >= 2.0
 
 
 def test_adaptive_rays_change_little(device: Device) -> None:
