@@ -72,7 +72,8 @@ def test_thin_glass_over_a_far_wall(subject: Subject, alpha: float, glass_m: flo
     keep_promises(subject, case, frame, image)
     off = np.abs(image - frame.pinhole_image())
     # The published matting repeats glass in two layers.
-    bound = 1.2 if subject.name == "layered paper" else 1e-5
+    # Multiview sums up to 256 rays of a light of 5 in float32.
+    bound = 1.2 if subject.name == "layered paper" else 2e-5
     subject.check(case, "off by", off[16:-16, 16:-16].max(), bound)
     # Rays of which only a part is known count as if that were all.
     if subject.method in ("lightfield", "multiview"):
