@@ -27,11 +27,12 @@ import numpy as np
 
 from . import __version__
 from .camera import Camera
-from .errors import CldofError, DeviceError, FrameError, InputError
+from .errors import CldofError, DeviceError, FrameError, InputError, SceneError
 from .files import atomic_write, read_json
 from .focus import autofocus, focus_at, focus_on
 from .frame import LayeredFrame
 from .lens import Aperture, DiscAperture, GaussianAperture, ImageAperture, Lens, PolygonAperture
+from .lighting import Environment
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -184,6 +185,12 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
         "--camera", metavar="FILE", help="JSON with yfov_deg, pose_camera_to_world (4x4, glTF axes), znear, zfar"
     )
     view.add_argument("--unlit", action="store_true", help="show base colours without any light")
+    view.add_argument(
+        "--environment",
+        metavar="FILE",
+        help="light the scene by this equirectangular picture in place of ambient light, and show it as the sky; "
+        ".exr and .npy are linear, anything else is sRGB",
+    )
     view.add_argument("--transparent", action="store_true", help="leave out the background; alpha tells where it was")
     view.add_argument("--peels", type=int, metavar="N", help=f"layers to capture at most (default {_DEFAULT_PEELS})")
     view.add_argument(
@@ -523,8 +530,9 @@ def _check_options(arguments: argparse.Namespace) -> None:
         raise InputError(f"--camera says where to look from; leave out {', '.join(given)}.")
     if _is_saved_frame(arguments.scene):
         given = _flags(
-            arguments, "size", "yfov", "camera", "unlit", "transparent", "peels", "save_frame", "azimuth", "elevation"
-        )
+            arguments, "size", "yfov", "camera", "unlit", "environment", "transparent", "peels", "save_frame",
+            "azimuth", "elevation",
+        )  # fmt: skip
         if given:
             raise InputError(
                 f"{arguments.scene} is a captured frame with a view of its own; leave out {', '.join(given)}."
@@ -706,7 +714,19 @@ def _scene(arguments: argparse.Namespace) -> Scene:
     scene = find_scene(arguments.scene, unlit=arguments.unlit, **view)
     if turned and scene.camera is not None:
         raise InputError(f"{arguments.scene} has a camera of its own; leave out {', '.join(turned)}, or use --camera.")
+    if arguments.environment:
+        around = _environment(arguments.environment)
+        scene = dataclasses.replace(scene, environment=around, background=around)
     return dataclasses.replace(scene, background=None) if arguments.transparent else scene
+
+
+def _environment(path: str) -> Environment:
+    from .images import read_linear
+
+    try:
+        return Environment(read_linear(path))
+    except SceneError as error:
+        raise SceneError(f"--environment {path}: {error}") from None
 
 
 def _camera(arguments: argparse.Namespace, scene: Scene) -> Camera:

@@ -31,6 +31,7 @@ __all__ = [
     "check_writable",
     "linear_from_srgb",
     "opened_picture",
+    "read_linear",
     "read_metadata",
     "save_image",
     "srgb8_from_linear",
@@ -189,6 +190,57 @@ def save_image(
         raise InputError(f"Image reaches {array.max():g}, beyond half floats (65504); write full floats.")
     writer = _WRITERS[target.suffix.lower()]
     writer(target, array.astype(np.float16) if half else array, text)
+
+
+def read_linear(path: str | Path) -> NDArray[np.float32]:
+    """Read a picture as linear light, (H, W, 3) float32, alpha left out.
+
+    ``.exr`` and ``.npy`` hold linear light; everything else (PNG, JPEG, ...) is taken for 8-bit sRGB.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or holds something else.
+    """
+    source = Path(path)
+    suffix = source.suffix.lower()
+    try:
+        if suffix == ".npy":
+            array = np.load(source, mmap_mode="r", allow_pickle=False)
+        elif suffix == ".exr":
+            array = _read_exr(source)
+        else:
+            check_picture(source, str(source))
+            with opened_picture(source, str(source)) as picture:
+                return linear_from_srgb(np.asarray(picture.convert("RGB")) / np.float32(255.0))
+        if array.dtype.kind != "f" or array.ndim != 3 or array.shape[2] not in (3, 4):
+            raise InputError(
+                f"{source} holds {array.dtype} of shape {array.shape}; it must be floats, (H, W, 3) or (H, W, 4)."
+            )
+        if array.shape[0] * array.shape[1] > _MOST_PIXELS:
+            raise InputError(f"{source} has {array.shape[1]}x{array.shape[0]} pixels; at most {_MOST_PIXELS} are read.")
+        return np.array(array[..., :3], np.float32)
+    except InputError:
+        raise
+    except Exception as error:  # decoders of damaged files raise whatever comes
+        raise InputError(f"Cannot read {source}: {getattr(error, 'strerror', None) or error}.") from error
+
+
+def _read_exr(source: Path) -> NDArray[Any]:
+    import OpenEXR
+
+    # The header first: a damaged one may promise any number of pixels.
+    with OpenEXR.File(str(source), header_only=True) as exr:
+        low, high = exr.header()["dataWindow"]
+        width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+    if width * height > _MOST_PIXELS:
+        raise InputError(f"{source} has {width}x{height} pixels; at most {_MOST_PIXELS} are read.")
+    with OpenEXR.File(str(source)) as exr:
+        channels = exr.channels()
+        name = next((name for name in ("RGBA", "RGB") if name in channels), None)
+        if name is None:
+            raise InputError(f"{source} has channels {', '.join(channels)}; it must have R, G and B.")
+        return np.array(channels[name].pixels)
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:

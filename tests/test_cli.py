@@ -705,3 +705,18 @@ def test_accumulates_as_the_centre_sees_it() -> None:
     base = ["render", "mirrors", "--method", "accumulate", "--views", "8", "--size", "40x30", "--quiet"]
     assert main([*base, "-o", "own.npy"]) == 0 and main([*base, "-o", "centre.npy", "--no-view-dependent"]) == 0
     assert np.abs(np.load("own.npy") - np.load("centre.npy")).max() > 0.05
+
+
+def test_lights_a_scene_by_an_environment(on_device: DeviceInfo, capsys: pytest.CaptureFixture[str]) -> None:
+    require_opengl()
+    around = np.zeros((8, 16, 3), np.float32)
+    around[:4, :, 2], around[4:, :, 0] = 2.0, 0.5  # blue above, red below
+    np.save("around.npy", around)
+    base = ["render", "floating", "-o", "out.npy", "--size", "48x36", "--peels", "2", "--quiet"]
+    assert main([*base, "--environment", "around.npy"]) == 0
+    image = np.load("out.npy")
+    assert (image[..., 3] > 0.999).all()
+    assert image[2, 24, 2] > 1.5 and image[33, 24, 0] > 0.3
+    np.save("around.npy", -around)
+    assert main([*base, "--environment", "around.npy"]) == 2
+    assert "--environment around.npy: Environment image has 128 values" in capsys.readouterr().err

@@ -15,6 +15,7 @@ from cldof import InputError, OutputError
 from cldof.images import (
     check_writable,
     linear_from_srgb,
+    read_linear,
     read_metadata,
     save_image,
     srgb8_from_linear,
@@ -180,3 +181,32 @@ def test_metadata_of_other_files(tmp_path: Path) -> None:
             read_metadata(tmp_path / name)
     with pytest.raises(InputError, match="not an image of ours"):
         read_metadata(tmp_path / "image.jpg")
+
+
+def test_linear_pictures_are_read_as_they_were_written(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).random((5, 8, 4), np.float32) * 4.0
+    image[..., 3] = 1.0
+    for name in ("a.exr", "a.npy"):
+        save_image(tmp_path / name, image)
+        np.testing.assert_array_equal(read_linear(tmp_path / name), image[..., :3])
+    save_image(tmp_path / "a.png", image * (0.25, 0.25, 0.25, 1.0))
+    np.testing.assert_allclose(read_linear(tmp_path / "a.png"), image[..., :3] / 4.0, atol=6e-3)
+
+
+def test_what_is_no_picture_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "flat.npy", np.zeros((4, 8)))
+    np.save(tmp_path / "bytes.npy", np.zeros((4, 8, 3), np.uint8))
+    (tmp_path / "text.exr").write_bytes(b"not a picture")
+    (tmp_path / "text.npy").write_bytes(b"not an array")
+    (tmp_path / "text.png").write_bytes(b"not a picture")
+    for name, says in (
+        ("flat.npy", "float64 of shape"),
+        ("bytes.npy", "uint8 of shape"),
+        ("text.exr", "Cannot read"),
+        ("text.npy", "Cannot read"),
+        ("text.png", "Cannot read"),
+        ("none.exr", "Cannot read"),
+        ("none.npy", "No such file"),
+    ):
+        with pytest.raises(InputError, match=says):
+            read_linear(tmp_path / name)
