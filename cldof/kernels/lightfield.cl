@@ -50,8 +50,12 @@
 
 #define NONE 0xffffffffu
 #define SUB 256.0f           /* positions per pixel */
-#define EDGE_NONE (-128)     /* no neighbour of the same surface on this side */
-#define EDGE_STEPS 16.0f     /* an edge is the difference of CoC to the neighbour, in 1/16 px */
+#define EDGE_STEPS 16.0f     /* an edge is the difference of CoC to the neighbour, in 1/16 px; or codes of an end: */
+#define END_CODE 128         /* the surface ends on this side: END_CODE + level; level 0 knows no more than the pixel */
+#define END_LEVELS 7         /* levels -7 to 7 but 0 put the end (|level| - 1/2) / 14 px out or in */
+#define END_STEP 18          /* 1/256 px a level */
+#define END_NEAR 6           /* pixels of a silhouette to look at each way ... */
+#define END_FAR 16           /* ... and farther on while it is straight along the axis */
 #define EDGE_OVERLAP 8       /* 1/256 px: neighbours overlap by this much, so that rounding leaves no seam */
 #define SAME_SURFACE_PX 1.0f /* neighbours whose CoC differ by no more are one surface: a gap of at most a pixel */
 #define STEEP_PX 7.5f        /* at the most, for neighbours whose CoC go on in a straight line */
@@ -101,12 +105,18 @@ static inline float coc_of(float w, LightfieldLens lens)
     return c > MAX_COC_PX ? MAX_COC_PX : c;
 }
 
-/* Difference of CoC to the neighbour (dx, dy) of a slot if both belong to one surface, else MAXFLOAT. */
+static inline int is_in_layers(LightfieldSize size, int x, int y)
+{
+    return x >= 0 && x < size.width && y >= 0 && y < size.height;
+}
+
+/* Difference of CoC to the neighbour (dx, dy) of a slot if both belong to one surface, else MAXFLOAT. A step of more
+ * than a pixel is a slope and no edge only where it goes on straight both ways. */
 static inline float edge_of(const __global float *inv_depth, LightfieldSize size, LightfieldLens lens, int m, int x,
                             int y, int dx, int dy, float c)
 {
     const int nx = x + dx, ny = y + dy;
-    if (nx < 0 || nx >= size.width || ny < 0 || ny >= size.height) return MAXFLOAT;
+    if (!is_in_layers(size, nx, ny)) return MAXFLOAT;
     const size_t plane = (size_t)size.height * size.pitch;
     const __global float *there = inv_depth + (size_t)ny * size.pitch + nx;
     const float w = there[m * plane];
@@ -124,22 +134,72 @@ static inline float edge_of(const __global float *inv_depth, LightfieldSize size
     if (absolute(best) <= SAME_SURFACE_PX) return best;
     if (absolute(d) > STEEP_PX) return MAXFLOAT;
     const int ax = nx + dx, ay = ny + dy, bx = x - dx, by = y - dy;
-    if (ax >= 0 && ax < size.width && ay >= 0 && ay < size.height) {
-        float v = inv_depth[m * plane + (size_t)ay * size.pitch + ax];
-        if (v >= 0.0f && absolute(coc_of(v, lens) - c - 2.0f * d) <= STRAIGHT * absolute(d)) return d;
-    }
-    if (bx >= 0 && bx < size.width && by >= 0 && by < size.height) {
-        float v = inv_depth[m * plane + (size_t)by * size.pitch + bx];
-        if (v >= 0.0f && absolute(coc_of(v, lens) - c + d) <= STRAIGHT * absolute(d)) return d;
-    }
-    return MAXFLOAT;
+    if (!is_in_layers(size, ax, ay) || !is_in_layers(size, bx, by)) return MAXFLOAT;
+    const float ahead = inv_depth[m * plane + (size_t)ay * size.pitch + ax];
+    const float behind = inv_depth[m * plane + (size_t)by * size.pitch + bx];
+    const int is_straight = ahead >= 0.0f && absolute(coc_of(ahead, lens) - c - 2.0f * d) <= STRAIGHT * absolute(d)
+                            && behind >= 0.0f && absolute(coc_of(behind, lens) - c + d) <= STRAIGHT * absolute(d);
+    return is_straight ? d : MAXFLOAT;
 }
 
-static inline uint edge_code(float d)
+/* Whether a pixel holds the surface of CoC c, in any peel. */
+static inline int is_on_surface(const __global float *inv_depth, LightfieldSize size, LightfieldLens lens, int x, int y,
+                                float c)
 {
-    if (d == MAXFLOAT) return (uint)EDGE_NONE & 255u;
-    int q = (int)(d * EDGE_STEPS + (d < 0.0f ? -0.5f : 0.5f));
-    return (uint)q & 255u;
+    if (!is_in_layers(size, x, y)) return 0;
+    const __global float *there = inv_depth + (size_t)y * size.pitch + x;
+    for (int m = 0; m < size.peels; m++, there += (size_t)size.height * size.pitch)
+        if (*there >= 0.0f && absolute(coc_of(*there, lens) - c) <= SAME_SURFACE_PX) return 1;
+    return 0;
+}
+
+/* Code of a silhouette on side (dx, dy) of a slot of CoC c. A pixel tells where an edge runs to half a pixel, but the
+ * staircase along it tells more: its mean over a stretch that is centred here, with triangular weights, in whole
+ * numbers. Where the staircase bends or is lost, the stretch ends. */
+static inline uint end_code(const __global float *inv_depth, LightfieldSize size, LightfieldLens lens, int m, int x,
+                            int y, int dx, int dy, float c)
+{
+    const __global float *own = inv_depth + ((size_t)m * size.height + y) * size.pitch + x;
+    if (!is_in_layers(size, x + dx, y + dy)) return END_CODE;
+    if (own[dy * size.pitch + dx] > *own) return END_CODE; /* it goes on behind something */
+    int out[2] = {0, 0}, sum = 0, total = 0, length = 1, slope = 0, is_regular = 1;
+    for (int k = 1; k <= END_FAR; k++) {
+        int found = 0;
+        for (int side = 0; side < 2; side++) {
+            const int along = side ? k : -k, last = out[side];
+            for (int i = 0; i < 3; i++) {
+                const int j = last + (i == 0 ? 0 : i == 1 ? -1 : 1);
+                const int u = x + along * (dy != 0) + j * dx, v = y + along * (dx != 0) + j * dy;
+                if (!is_in_layers(size, u + dx, v + dy) || !is_on_surface(inv_depth, size, lens, u, v, c)
+                    || is_on_surface(inv_depth, size, lens, u + dx, v + dy, c))
+                    continue;
+                out[side] = j;
+                found++;
+                break;
+            }
+        }
+        const int bend = out[0] + out[1];
+        if (found < 2 || bend > 1 || bend < -1) break;
+        sum += bend;
+        total += sum;
+        length++;
+        slope = k == 1 ? out[1] : slope;
+        is_regular &= out[1] == k * slope && out[0] == -k * slope;
+        if (k >= END_NEAR && out[0] != 0 && out[1] != 0) break;
+    }
+    if (is_regular) return END_CODE;
+    const int level = (total < 0 ? -total : total) * 2 * END_LEVELS / (length * length) + 1;
+    const int at_most = level < END_LEVELS ? level : END_LEVELS;
+    return (uint)(END_CODE + (total < 0 ? -at_most : at_most));
+}
+
+/* CoC to the neighbour in 1/16 px, or how the surface ends; a byte. */
+static inline uint edge_code(const __global float *inv_depth, LightfieldSize size, LightfieldLens lens, int m, int x,
+                             int y, int dx, int dy, float c)
+{
+    const float d = edge_of(inv_depth, size, lens, m, x, y, dx, dy, c);
+    if (d == MAXFLOAT) return end_code(inv_depth, size, lens, m, x, y, dx, dy, c);
+    return (uint)(int)(d * EDGE_STEPS + (d < 0.0f ? -0.5f : 0.5f)) & 255u;
 }
 
 static inline int is_glass(const __global float *color, LightfieldSize size, int m, int x, int y)
@@ -259,7 +319,7 @@ static inline int16 edge_code16(float16 d)
  * writes  slot_at    uint[peels][height][pitch]   where in inv_depth the slot stands
  *         slot_key   uint[peels][height][pitch]   depth_key
  *         slot_coc   float[peels][height][pitch]  CoC in 1/256 px
- *         slot_edge  uint[peels][height][pitch]   4 x int8: CoC to the left, right, upper, lower neighbour; edge_code
+ *         slot_edge  uint[peels][height][pitch]   4 bytes: left, right, upper, lower edge; see edge_code
  *         slot_plane uchar[peels][height][pitch]  with LIGHTFIELD_GLASS
  *         slot_count int[peels][height]
  *         cells      uchar[peels][height][pitch]  1: the pixel and those right, below and both are one surface
@@ -327,10 +387,10 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
             uint edge = ((const uint *)&edges)[i];
 #if LIGHTFIELD_SUPPORT == 3
             if (!((const int *)&is_plain)[i])
-                edge = edge_code(edge_of(inv_depth, size, lens, m, x, y, -1, 0, coc))
-                     | edge_code(edge_of(inv_depth, size, lens, m, x, y, 1, 0, coc)) << 8
-                     | edge_code(edge_of(inv_depth, size, lens, m, x, y, 0, -1, coc)) << 16
-                     | edge_code(edge_of(inv_depth, size, lens, m, x, y, 0, 1, coc)) << 24;
+                edge = edge_code(inv_depth, size, lens, m, x, y, -1, 0, coc)
+                     | edge_code(inv_depth, size, lens, m, x, y, 1, 0, coc) << 8
+                     | edge_code(inv_depth, size, lens, m, x, y, 0, -1, coc) << 16
+                     | edge_code(inv_depth, size, lens, m, x, y, 0, 1, coc) << 24;
 #endif
             slot_edge[to] = edge;
 #if LIGHTFIELD_GLASS
@@ -364,10 +424,16 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
     }
 
 
-/* How far an edge lies beyond the pixel's own half: it goes half-way to the neighbour, v * d / 2 = v * q * 8. */
-#define EDGE_REACH(q, moved, shear) ((q) == EDGE_NONE ? 0 : (moved) + (shear) + EDGE_OVERLAP)
+/* How far an edge lies beyond the pixel's own half: it goes half-way to the neighbour, v * d / 2 = v * q * 8. Where the
+ * surface ends at a known place, varying the place of the sample would only blur what is known: it is taken back. */
+#define EDGE_REACH(q, moved, shear, place)                                                                            \
+    (IS_END(q) ? END_REACH(END_LEVEL(q), place) : (moved) + (shear) + EDGE_OVERLAP)
+#define END_REACH(level, place)                                                                                       \
+    ((level) == 0 ? 0 : (level) * END_STEP + ((level) < 0 ? END_STEP / 2 : -END_STEP / 2) + (place))
 #define EDGE_BYTE(edge, shift) ((edge) << (24 - (shift)) >> 24)
-#define KNOWN_EDGE(q) ((q) == EDGE_NONE ? 0 : (q) < 0 ? -(q) : (q))
+#define IS_END(q) ((q) >= END_CODE - END_LEVELS || (q) <= END_LEVELS - END_CODE)
+#define END_LEVEL(q) (((q) & 255) - END_CODE)
+#define KNOWN_EDGE(q) (IS_END(q) ? 0 : (q) < 0 ? -(q) : (q))
 #define LARGER(a, b) ((a) > (b) ? (a) : (b))
 
 /* Pixels of the view that slots cover: columns x0 to before x1, rows y0 to before y1. Rows and columns of a slope shear
@@ -379,10 +445,11 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
     const float slope_x = 8.0f * (v).x, slope_y = 8.0f * (v).y;                                                       \
     const INT shear_x = TO_INT(TO_FLOAT(LARGER(KNOWN_EDGE(u), KNOWN_EDGE(d))) * absolute(slope_x));                   \
     const INT shear_y = TO_INT(TO_FLOAT(LARGER(KNOWN_EDGE(l), KNOWN_EDGE(r))) * absolute(slope_y));                   \
-    SPAN(INT, x0, x1, at_x, EDGE_REACH(l, -TO_INT(TO_FLOAT(l) * slope_x), shear_x),                                   \
-         EDGE_REACH(r, TO_INT(TO_FLOAT(r) * slope_x), shear_x))                                                       \
-    SPAN(INT, y0, y1, at_y, EDGE_REACH(u, -TO_INT(TO_FLOAT(u) * slope_y), shear_y),                                   \
-         EDGE_REACH(d, TO_INT(TO_FLOAT(d) * slope_y), shear_y))
+    const int place_x = (int)(v).z, place_y = (int)(v).w;                                                             \
+    SPAN(INT, x0, x1, at_x, EDGE_REACH(l, -TO_INT(TO_FLOAT(l) * slope_x), shear_x, place_x),                          \
+         EDGE_REACH(r, TO_INT(TO_FLOAT(r) * slope_x), shear_x, -place_x))                                             \
+    SPAN(INT, y0, y1, at_y, EDGE_REACH(u, -TO_INT(TO_FLOAT(u) * slope_y), shear_y, place_y),                          \
+         EDGE_REACH(d, TO_INT(TO_FLOAT(d) * slope_y), shear_y, -place_y))
 
 static inline int16 load_ints(const __global uint *p) { return as_int16(load_quad((const __global float *)p)); }
 

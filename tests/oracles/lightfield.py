@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 NONE = 0xFFFFFFFF
-UNKNOWN = -128  # edge to a neighbour of another surface
+UNKNOWN = -128  # the surface ends on this side, nobody knows where in the pixel
 SAME_SURFACE, STEEP, STRAIGHT = 1.0, 7.5, 0.25
 OPAQUE = np.float32(0.999)
 
@@ -22,7 +22,7 @@ class Slots(NamedTuple):
     y: np.ndarray
     key: np.ndarray  # uint32, smaller is nearer
     coc: np.ndarray  # float32, 1/256 px
-    edges: np.ndarray  # (N, 4) left, right, above, below, in 1/16 px
+    edges: np.ndarray  # (N, 4) left, right, above, below: signed bytes, see `edges`
     plane: np.ndarray
 
 
@@ -37,7 +37,11 @@ def depth_key(inv_depth: np.ndarray) -> np.ndarray:
 
 
 def edges(inv_depth: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """CoC to the four neighbours in 1/16 px, :data:`UNKNOWN` where the surface ends; (M, H, W, 4) of whole numbers."""
+    """What is on the four sides of each slot, (M, H, W, 4) of signed bytes.
+
+    CoC to the neighbour in 1/16 px; where the surface ends, 128 + level as a byte, where levels 1 to 7 put the end
+    0 to 1/2 px beyond the pixel, -1 to -7 before it, and 0 (:data:`UNKNOWN`) says no more.
+    """
     peels, height, width = inv_depth.shape
     result = np.full((peels, height, width, 4), UNKNOWN)
 
@@ -58,16 +62,77 @@ def edges(inv_depth: np.ndarray, c: np.ndarray) -> np.ndarray:
                 pass
             elif elsewhere and abs(min(elsewhere, key=abs)) <= SAME_SURFACE:
                 d = min(elsewhere, key=abs)
-            elif d is None or abs(d) > STEEP:
-                continue
             else:
                 beyond, behind = at(m, y + 2 * dy, x + 2 * dx), at(m, y - dy, x - dx)
-                straight = beyond is not None and abs(beyond - own - 2 * d) <= STRAIGHT * abs(d)
-                straight |= behind is not None and abs(behind - own + d) <= STRAIGHT * abs(d)
-                if not straight:
-                    continue
-            result[m, y, x, side] = int(d * 16 + (-0.5 if d < 0 else 0.5))
+                if (
+                    d is None
+                    or abs(d) > STEEP
+                    or beyond is None
+                    or behind is None
+                    or abs(beyond - own - 2 * d) > STRAIGHT * abs(d)
+                    or abs(behind - own + d) > STRAIGHT * abs(d)
+                ):
+                    d = None
+            if d is None:
+                level = _end_level(c, inv_depth, (m, y, x), (dy, dx))
+                result[m, y, x, side] = (128 + level + 128) % 256 - 128
+            else:
+                result[m, y, x, side] = int(d * 16 + (-0.5 if d < 0 else 0.5))
     return result
+
+
+def _end_level(c: np.ndarray, inv_depth: np.ndarray, slot: tuple[int, int, int], out: tuple[int, int]) -> int:
+    """Where the silhouette on one side of a slot runs, from its staircase along the other axis."""
+    m, y, x = slot
+    height, width = c.shape[1:]
+
+    def is_on(v: int, u: int) -> bool:
+        if not (0 <= v < height and 0 <= u < width):
+            return False
+        return bool(((inv_depth[:, v, u] >= 0) & (np.abs(c[:, v, u] - c[m, y, x]) <= SAME_SURFACE)).any())
+
+    def ends_at(v: int, u: int) -> bool:
+        inside = 0 <= v + out[0] < height and 0 <= u + out[1] < width
+        return inside and is_on(v, u) and not is_on(v + out[0], u + out[1])
+
+    if not (0 <= y + out[0] < height and 0 <= x + out[1] < width):
+        return 0
+    if inv_depth[m, y + out[0], x + out[1]] > inv_depth[m, y, x]:
+        return 0
+    along = (abs(out[1]), abs(out[0]))
+    stairs = [0]  # how far out the silhouette stands on both sides together, at growing distance
+    at, slope, is_regular = {-1: 0, 1: 0}, 0, True
+    for k in range(1, 17):
+        for side in (-1, 1):
+            steps = [at[side] + step for step in (0, -1, 1)]
+            found = [
+                j for j in steps if ends_at(y + side * k * along[0] + j * out[0], x + side * k * along[1] + j * out[1])
+            ]
+            if not found:
+                break
+            at[side] = found[0]
+        else:
+            if abs(at[-1] + at[1]) <= 1:
+                stairs.append(at[-1] + at[1])
+                slope = at[1] if k == 1 else slope
+                is_regular &= at[1] == k * slope and at[-1] == -k * slope
+                if k >= 6 and at[-1] and at[1]:
+                    break
+                continue
+        break
+    if is_regular:
+        return 0
+    n = len(stairs)
+    mean = sum((n - k) * out_by for k, out_by in enumerate(stairs))  # over n * n
+    level = min(abs(mean) * 14 // (n * n) + 1, 7)
+    return -level if mean < 0 else level
+
+
+def end_reach(edge: np.ndarray, place: int) -> tuple[np.ndarray, np.ndarray]:
+    """Whether a surface ends on this side, and how far beyond its half pixel, in 1/256 px."""
+    level = (edge & 255) - 128
+    known = np.sign(level) * (np.abs(level) * 18 - 9) + place
+    return (np.abs(level) <= 7), np.where(level == 0, 0, known)
 
 
 def slots(
@@ -117,11 +182,13 @@ def footprints(some: Slots, view: np.ndarray, guard: int, support: str) -> tuple
         v = float(view[axis])
         position = 256 * (place - guard) + _product(some.coc, v) + int(view[2 + axis])
         own, across = some.edges[:, 2 * axis : 2 * axis + 2], some.edges[:, 2 - 2 * axis : 4 - 2 * axis]
-        widest = np.where(across == UNKNOWN, 0, np.abs(across)).max(axis=1)
+        widest = np.where(end_reach(across, 0)[0], 0, np.abs(across)).max(axis=1)
         shear = _product(widest, abs(np.float32(8) * np.float32(v)))
         moved = _product(own, np.float32(8) * np.float32(v))
-        low = np.where(own[:, 0] == UNKNOWN, 0, -moved[:, 0] + shear + 8)
-        high = np.where(own[:, 1] == UNKNOWN, 0, moved[:, 1] + shear + 8)
+        ends, reach = end_reach(own[:, 0], int(view[2 + axis]))
+        low = np.where(ends, reach, -moved[:, 0] + shear + 8)
+        ends, reach = end_reach(own[:, 1], -int(view[2 + axis]))
+        high = np.where(ends, reach, moved[:, 1] + shear + 8)
         spans += _span(position, low, high, support)
     return tuple(spans)
 
