@@ -83,5 +83,6 @@ def render_frame(device: Device, method: Method, frame: LayeredFrame, lens: Lens
     shape = FrameShape.of(frame)
     plan = method.plan(frame, lens)
     program = method.program(shape, plan, device.traits)
-    inputs = {"color": frame.color, "inv_depth": inverse_depth(device, frame)}
+    arrays = {"color": frame.color, "inv_depth": inverse_depth(device, frame), **frame.inputs}
+    inputs = {name: arrays[name] for name, buffer in program.buffers.items() if buffer.role is Role.INPUT}
     return run_program(device, program, inputs, dict(plan.params), "image", (*shape.output_size, 4))

@@ -43,9 +43,17 @@
 #ifndef LIGHTFIELD_LEVELS
 #define LIGHTFIELD_LEVELS 0
 #endif
+/* 1: colours lack what surfaces mirror, which every ray adds as its point of the lens sees it. */
+#ifndef LIGHTFIELD_SHADED
+#define LIGHTFIELD_SHADED 0
+#endif
 /* 1: 64-bit atomic minimum. */
 #ifndef LIGHTFIELD_PACKED
 #define LIGHTFIELD_PACKED 0
+#endif
+
+#if LIGHTFIELD_SHADED
+#include "shading.clh"
 #endif
 
 #define NONE 0xffffffffu
@@ -87,6 +95,7 @@ typedef struct {
     float cos4;   /* (aperture radius / focal length)^2; 0 leaves the attenuation out */
     float cell;   /* a ray's share of the CoC is 2 * |C| * cell px wide, and mip level log2(|C| * cell) shows it */
     int reach;    /* px: no slot moves farther than this */
+    float radius; /* m, of the lens */
 } LightfieldLens;
 
 static inline float absolute(float v) { return v < 0.0f ? -v : v; }
@@ -649,7 +658,25 @@ static inline float4 jittered_color(const __global float *color, const __global 
     return base;
 }
 
+/* What look-ups take if there is a pyramid, and if rays are shaded. */
+#define MIP_PARAMS
+#define MIP_ARGS
+#define SHADE_PARAMS
+#define SHADE_ARGS
+#if LIGHTFIELD_SHADED
+#undef SHADE_PARAMS
+#undef SHADE_ARGS
+#define SURFACE_PLANES 7 /* as shading_split writes them */
+#define SHADE_PARAMS                                                                                                  \
+    , const __global float *surface, const __global float4 *lighting, const __global float4 *environment, float4 eye
+#define SHADE_ARGS , surface, lighting, environment, eye
+#endif
+
 #if LIGHTFIELD_LEVELS
+#undef MIP_PARAMS
+#undef MIP_ARGS
+#define MIP_PARAMS , const __global float *mips, const __global float *mip_depths, LightfieldMips mip_sizes
+#define MIP_ARGS , mips, mip_depths, mip_sizes
 typedef struct {
     int width[LIGHTFIELD_LEVELS], height[LIGHTFIELD_LEVELS], first[LIGHTFIELD_LEVELS]; /* pixels; of level 1 and up */
 } LightfieldMips;
@@ -740,11 +767,8 @@ __kernel void lightfield_shrink_again(__global float *mips, __global float *mip_
 
 /* Colour of a ray that no plain cell holds, or that is wide. */
 static inline float4 ray_color(const __global float *color, const __global float *inv_depth, LightfieldSize size,
-                               LightfieldLens lens, uint at, int ray_x, int ray_y, float w, float c, uint seed
-#if LIGHTFIELD_LEVELS
-                               , const __global float *mips, const __global float *mip_depths, LightfieldMips sizes
-#endif
-)
+                               LightfieldLens lens, uint at, int ray_x, int ray_y, float w, float c,
+                               uint seed MIP_PARAMS)
 {
     const int line = at / (uint)size.pitch, x = at - line * size.pitch;
     const int m = line / size.height, y = line - m * size.height;
@@ -755,7 +779,7 @@ static inline float4 ray_color(const __global float *color, const __global float
     /* The nearest whole level: log2(width) rounded. */
     for (float step = 1.41421356f; level < LIGHTFIELD_LEVELS && width >= step; step *= 2.0f) level++;
     for (; level > 0; level--) {
-        const float4 wide = mip_color(mips, mip_depths, sizes, lens, level, m, ray_x, ray_y, w, c, base);
+        const float4 wide = mip_color(mips, mip_depths, mip_sizes, lens, level, m, ray_x, ray_y, w, c, base);
         if (wide.w >= 0.0f) return wide;
     }
 #endif
@@ -768,10 +792,74 @@ static inline float4 ray_color(const __global float *color, const __global float
 #endif
 }
 
-#if LIGHTFIELD_LEVELS
-#define RAY_COLOR(...) ray_color(__VA_ARGS__, mips, mip_depths, mip_sizes)
-#else
-#define RAY_COLOR(...) ray_color(__VA_ARGS__)
+#if LIGHTFIELD_SHADED
+static inline int is_run(int16 at)
+{
+    const int16 off = at - at.s0 - LANES;
+    const int8 eight = off.lo | off.hi;
+    const int4 four = eight.lo | eight.hi;
+    return !(four.x | four.y | four.z | four.w);
+}
+
+static inline float16 between(float16 a, float16 b, float16 c, float16 d, float16 fx, float16 fy)
+{
+    const float16 above = a + fx * (b - a), below = c + fx * (d - c);
+    return above + fy * (below - above);
+}
+
+/* What sixteen rays find mirrored where they hit, from the surface buffers: normals between the corners of a cell that
+ * is one surface, everything else at the winner. Without that, curved things mirror in facets of a pixel each.
+ * `at` and `cell` are places of winners and cells, `peel_at` where their peel starts; is_cell: -1 where a cell is one
+ * surface. */
+static inline void mirrored(float4 found[16], const uint2 hits[16], int end, int16 at, int16 cell, int16 peel_at,
+                            int16 is_cell, int peel, int pitch, int16 ray_x, int16 ray_y, float16 fx, float16 fy,
+                            float16 w SHADE_PARAMS)
+{
+    float16 normal[3], rest[SURFACE_PLANES - 3];
+    const int8 eight = is_cell.lo & is_cell.hi;
+    const int4 four = eight.lo & eight.hi;
+    if (end == 16 && (four.x & four.y & four.z & four.w) && is_run(at) && is_run(cell)) {
+        const __global float *base = surface + (size_t)(SURFACE_PLANES - 1) * peel_at.s0;
+        for (int p = 0; p < 3; p++) {
+            const __global float *n = base + (size_t)p * peel + cell.s0;
+            normal[p] = between(load_quad(n), load_quad(n + 1), load_quad(n + pitch), load_quad(n + pitch + 1), fx, fy);
+        }
+        for (int p = 3; p < SURFACE_PLANES; p++) rest[p - 3] = load_quad(base + (size_t)p * peel + at.s0);
+    } else {
+        float16 corner[3][4];
+        for (int i = 0; i < 16; i++) {
+            const int is_hit = i < end && hits[i].x != NONE, is_smooth = ((const int *)&is_cell)[i];
+            const __global float *base = surface
+                                         + (is_hit ? (size_t)(SURFACE_PLANES - 1) * ((const int *)&peel_at)[i] : 0);
+            const int own = is_hit ? ((const int *)&at)[i] : 0, first = is_smooth ? ((const int *)&cell)[i] : own;
+            const int across = is_smooth ? 1 : 0, down = is_smooth ? pitch : 0;
+            for (int p = 0; p < 3; p++) {
+                const __global float *n = base + (size_t)p * peel + first;
+                ((float *)&corner[p][0])[i] = n[0];
+                ((float *)&corner[p][1])[i] = n[across];
+                ((float *)&corner[p][2])[i] = n[down];
+                ((float *)&corner[p][3])[i] = n[down + across];
+            }
+            for (int p = 3; p < SURFACE_PLANES; p++)
+                ((float *)&rest[p - 3])[i] = is_hit ? base[(size_t)p * peel + own] : 0.0f;
+        }
+        for (int p = 0; p < 3; p++) normal[p] = between(corner[p][0], corner[p][1], corner[p][2], corner[p][3], fx, fy);
+    }
+    if (!(sum16(rest[0] + rest[1] + rest[2]) > 0.0f)) return;
+    const float16 square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
+    const float16 unit = square > 1e-12f ? shading_rsqrt(square) : (float16)(0.0f);
+    const Shading3 position = shading_position(lighting, convert_float16(ray_x) * (1.0f / SUB) + 0.5f,
+                                               convert_float16(ray_y) * (1.0f / SUB) + 0.5f, w);
+    const Shading3 n = shading_3(normal[0] * unit, normal[1] * unit, normal[2] * unit);
+    const Shading3 light = shading_specular(position, n, shading_3(rest[0], rest[1], rest[2]), rest[3], eye, lighting,
+                                            environment);
+    for (int i = 0; i < end; i++) {
+        if (hits[i].x == NONE) continue;
+        const float4 more = (float4)(((const float *)&light.x)[i], ((const float *)&light.y)[i],
+                                     ((const float *)&light.z)[i], 0.0f);
+        found[i] += found[i].w * more;
+    }
+}
 #endif
 
 /* Colours of sixteen rays of a view, side by side, from their winners; `end` of them count. (left, top) is the first
@@ -779,11 +867,7 @@ static inline float4 ray_color(const __global float *color, const __global float
 static inline int ray_colors(float4 found[16], uint2 hits[16], const __global uint2 *winners, int end,
                              const __global float *color, const __global float *inv_depth,
                              const __global uchar *cells, LightfieldSize size, LightfieldLens lens, int left, int top,
-                             float shift_x, float shift_y, uint seed
-#if LIGHTFIELD_LEVELS
-                             , const __global float *mips, const __global float *mip_depths, LightfieldMips mip_sizes
-#endif
-)
+                             float shift_x, float shift_y, uint seed MIP_PARAMS SHADE_PARAMS)
 {
     /* Addresses of all at once, colours one by one. */
     uint any = 0;
@@ -827,9 +911,11 @@ static inline int ray_colors(float4 found[16], uint2 hits[16], const __global ui
 #endif
     const float16 fx = convert_float16(ray_x & 255) * (1.0f / SUB);
     const float16 fy = convert_float16(ray_y & 255) * (1.0f / SUB);
+    int16 is_cell = 0;
     for (int i = 0; i < end; i++) {
         if (hits[i].x == NONE) continue;
         if (LIGHTFIELD_LOOKUP == 1 && ((const int *)&is_plain)[i] && cells[((const int *)&cell)[i]]) {
+            ((int *)&is_cell)[i] = -1;
             const __global float *corner = color + (size_t)((const uint *)&color_at)[i] * 4;
             const float gx = ((const float *)&fx)[i], gy = ((const float *)&fy)[i];
             const float4 p = load_pixel(corner), q = load_pixel(corner + size.width * 4);
@@ -837,23 +923,26 @@ static inline int ray_colors(float4 found[16], uint2 hits[16], const __global ui
             const float4 below = q + gx * (load_pixel(corner + size.width * 4 + 4) - q);
             found[i] = above + gy * (below - above);
         } else {
-            found[i] = RAY_COLOR(color, inv_depth, size, lens, hits[i].x, ((const int *)&ray_x)[i],
-                                 ((const int *)&ray_y)[i], ((const float *)&w)[i], ((const float *)&c)[i], seed + i);
+            found[i] = ray_color(color, inv_depth, size, lens, hits[i].x, ((const int *)&ray_x)[i],
+                                 ((const int *)&ray_y)[i], ((const float *)&w)[i], ((const float *)&c)[i],
+                                 seed + i MIP_ARGS);
         }
     }
+#if LIGHTFIELD_SHADED
+    mirrored(found, hits, end, at, cell, peel_at, is_cell, peel, size.pitch, ray_x, ray_y, fx, fy, w SHADE_ARGS);
+#endif
     return 1;
 }
-
-#if LIGHTFIELD_LEVELS
-#define RAY_COLORS(...) ray_colors(__VA_ARGS__, mips, mip_depths, mip_sizes)
-#else
-#define RAY_COLORS(...) ray_colors(__VA_ARGS__)
-#endif
 
 #if LIGHTFIELD_GLASS
 static inline int is_before(uint2 a, uint2 b) { return a.y < b.y || (a.y == b.y && a.x < b.x); }
 #endif
 
+#if LIGHTFIELD_SHADED
+#define PINHOLE_COLOR whole_color
+#else
+#define PINHOLE_COLOR color
+#endif
 /* The layers of a pixel one over the other, for where no view has anything to say. */
 static inline float4 pinhole(const __global float *color, LightfieldSize size, int x, int y)
 {
@@ -871,6 +960,8 @@ static inline float4 pinhole(const __global float *color, LightfieldSize size, i
  *         cells      uchar[peels][height][pitch]
  *         views      LightfieldView[]
  *         mips, mip_depths  see lightfield_shrink; with LIGHTFIELD_LEVELS
+ *         surface, lighting, environment  see shading.cl; with LIGHTFIELD_SHADED, where `color` lacks what is mirrored
+ *                                         and whole_color does not
  * updates sum        float[out_height][out_pitch][4]  colours so far, when not all views come at once
  *         seen       float[out_height][out_pitch]     their weights
  * writes  out        float[out_height][out_width][4]  after the last views
@@ -882,6 +973,11 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
 #if LIGHTFIELD_LEVELS
                                     const __global float *restrict mips, const __global float *restrict mip_depths,
                                     LightfieldMips mip_sizes,
+#endif
+#if LIGHTFIELD_SHADED
+                                    const __global float *restrict whole_color, const __global float *restrict surface,
+                                    const __global float4 *restrict lighting,
+                                    const __global float4 *restrict environment,
 #endif
                                     LightfieldSize size, LightfieldLens lens, int first_view, int view_count,
                                     int is_last)
@@ -903,14 +999,17 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
         const __global uint2 *own = winners + (size_t)s * size.planes * plane_size + here;
         const uint seed = ((uint)(first_view + s) << 24 ^ (uint)y << 12) + (uint)x0;
         const float shift_x = SUB * v.x, shift_y = SUB * v.y;
+#if LIGHTFIELD_SHADED
+        const float4 eye = shading_eye(lighting, v.x * lens.radius, -v.y * lens.radius);
+#endif
         const int left = (x0 + size.guard) << 8, top = (y + size.guard) << 8;
         for (int b = 0; b < n; b += 16) {
             const int end = n - b < 16 ? n - b : 16;
             float4 found[16];
             uint2 hits[16];
 #define RAYS_OF(colors, winners_of, plane)                                                                            \
-    RAY_COLORS(colors, winners_of, own + (plane) * plane_size + b, end, color, inv_depth, cells, size, lens,          \
-               left + (b << 8), top, shift_x, shift_y, seed + b)
+    ray_colors(colors, winners_of, own + (plane) * plane_size + b, end, color, inv_depth, cells, size, lens,          \
+               left + (b << 8), top, shift_x, shift_y, seed + b MIP_ARGS SHADE_ARGS)
 #if LIGHTFIELD_GLASS
             /* Rays that meet glass before what hides the rest: the panes over one another, then what is behind. A hole
              * behind glass counts as far as the glass covers it; or, if the frame lets the void through, as the void:
@@ -958,7 +1057,7 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
             continue;
         }
         float4 pixel = weights[i] > MIN_WEIGHT ? total[i] * (1.0f / weights[i])
-                                               : pinhole(color, size, x0 + i + size.guard, y + size.guard);
+                                               : pinhole(PINHOLE_COLOR, size, x0 + i + size.guard, y + size.guard);
         pixel.w = pixel.w < 1.0f ? pixel.w : 1.0f;
         store_pixel(out + ((size_t)y * size.out_width + x0 + i) * 4, pixel);
     }

@@ -30,6 +30,7 @@ from ..host.device import Traits
 from ..host.passes import Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
 from ..lens import Aperture, Lens
 from .base import FrameShape, Locality, Plan, row_pitch, struct_scalar
+from .shading import environment_of, shading_defines, shading_inputs, split_pass
 
 __all__ = ["MAX_VIEWS", "LightField", "Views", "lens_views"]
 
@@ -52,6 +53,10 @@ _NEGLIGIBLE_COC_PX = 1e-3
 # Work-items that a CPU core should get, so that none waits for the last one.
 _ITEMS_PER_CORE = 2
 _WINNER_BYTES = 8
+# Highlights that turn by less than this share of their width over the lens's radius look the same from all of it.
+_LEAST_TURN = 0.1
+# Pixels along a silhouette that say where in its pixel it runs, and one beside it.
+_STAIRCASE_PX = 17
 
 _SIZE = np.dtype(
     [
@@ -63,8 +68,11 @@ _SIZE = np.dtype(
     ]
 )  # fmt: skip
 _LENS = np.dtype(
-    [("c1", np.float32), ("c0", np.float32), ("cos4", np.float32), ("cell", np.float32), ("reach", np.int32)]
-)
+    [
+        ("c1", np.float32), ("c0", np.float32), ("cos4", np.float32), ("cell", np.float32), ("reach", np.int32),
+        ("radius", np.float32),
+    ]
+)  # fmt: skip
 _SLOTS = ("slot_at", "slot_key", "slot_coc", "slot_edge", "slot_plane", "slot_count")
 
 
@@ -74,6 +82,7 @@ class Views(NamedTuple):
     total: int
     aperture: Aperture
     levels: int  # of the mip pyramid, above the layers
+    is_shaded: bool = False  # from the views' own points
 
 
 @dataclass(frozen=True)
@@ -110,6 +119,9 @@ class LightField:
         Of the lens points.
     cull : bool
         Leave out what no view can see; changes no pixel.
+    view_dependent : bool
+        Shade what is glossy as each view's point of the lens sees it, in frames that know how (captured with surface
+        buffers). False: as the lens centre sees it.
     """
 
     views: int = 36
@@ -124,6 +136,7 @@ class LightField:
     warp: str = "auto"
     seed: int = 0
     cull: bool = True
+    view_dependent: bool = True
 
     name = "lightfield"
     simulated_aperture = None
@@ -160,35 +173,39 @@ class LightField:
         levels = 0
         if self.mip and largest > 0.0:
             levels = min(max(0, round(math.log2(largest * cell))), _MAX_LEVELS)
+        turn = frame.lobe_turn_per_m * lens.aperture_radius_m
+        is_shaded = self.view_dependent and count > 1 and turn > _LEAST_TURN
         focal_m = (lens.focal_length_mm or 0.0) * 1e-3
         params = np.zeros((), _LENS)
         params["c1"], params["c0"], params["cell"] = c1, c0, cell
         params["cos4"] = (lens.aperture_radius_m / focal_m) ** 2 if self.cos4 and focal_m else 0.0
+        params["radius"] = lens.aperture_radius_m
         params["reach"] = min(math.ceil(largest), _MAX_COC_PX) + _FOOTPRINT_PX
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},
             "views": count,
             "mip_levels": levels,
+            "eyes": count if is_shaded else 0,
             "largest_coc_px": largest,
         }
-        return Plan(Views(count, lens.aperture, levels), {"lens": params[()]}, summary)
+        return Plan(Views(count, lens.aperture, levels, is_shaded), {"lens": params[()]}, summary)
 
     def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality | None:
         """Slots move by their CoC.
 
-        Random pixels depend on their place in the image, and panes in focus, or what
-        is in focus before the void, are not quite what a pinhole sees.
+        Random pixels and what mirrors depend on their place in the image, and panes in focus, or what is in focus before
+        the void, are not quite what a pinhole sees.
         """
         views = plan.structure
         assert isinstance(views, Views)
-        if self.lookup == "jitter" or shape.has_glass or not shape.is_opaque:
+        if self.lookup == "jitter" or views.is_shaded or shape.has_glass or not shape.is_opaque:
             return None
         mips = 4 * 2**views.levels if views.levels else 0
         step = 1.0 / 512.0  # slots that move by less stay where they are
         return Locality(
             align_px=max(64, 2**views.levels),
-            margin_px=int(plan.params["lens"]["reach"]) + mips + 2 * _TILE,
+            margin_px=int(plan.params["lens"]["reach"]) + mips + 2 * _TILE + _STAIRCASE_PX,
             reach_px=lambda coc: coc + _FOOTPRINT_PX + mips,
             rim_px=1,  # rays take their samples all over a pixel, and interpolate
             leak=lambda coc: np.where(coc < step, 2.0 * coc, np.minimum(3.0 * coc + 2.0 / views.total, 1.0)),
@@ -271,6 +288,8 @@ class _Builder:
             Buffer("seen", pixels * 4),
         ]
         self.passes: list[Pass] = []
+        # What rays and the pyramid look up; see kernels/shading.cl.
+        self.color = "matte" if views.is_shaded else "color"
         self.lens = Param("lens", _LENS)
         warp = method.warp if method.warp != "auto" else "views" if traits.is_cpu else "atomic"
         if warp == "packed" and not traits.has_int64_atomics:
@@ -283,6 +302,8 @@ class _Builder:
             ("LIGHTFIELD_LOOKUP", _LOOKUPS.index(method.lookup)),
             ("LIGHTFIELD_LEVELS", views.levels),
             ("LIGHTFIELD_PACKED", int(warp == "packed")),
+            ("LIGHTFIELD_SHADED", int(views.is_shaded)),
+            *(shading_defines(shape) if views.is_shaded else ()),
         )
 
     def build(self) -> FrameProgram:
@@ -298,6 +319,10 @@ class _Builder:
             (self.peels * self.shape.height,),
             traffic_bytes=self.slots * 4,
         )
+        if self.views.is_shaded:
+            split, made = split_pass(self.shape, self.traits.is_cpu)
+            self.buffers += [*shading_inputs(self.shape), *made]
+            self.passes.append(split)
         mips = self._pyramid()
         for first in range(0, self.views.total, self.batch):
             count = min(self.batch, self.views.total - first)
@@ -336,7 +361,7 @@ class _Builder:
                 args: tuple[Any, ...] = (
                     write("mips"),
                     write("mip_depths"),
-                    read("color"),
+                    read(self.color),
                     read("inv_depth"),
                     self.size,
                 )
@@ -382,14 +407,18 @@ class _Builder:
         access = write if first == 0 else read_write
         is_last = first + count == self.views.total
         pixels = self.out_height * self.out_width
+        shading: tuple[Any, ...] = ()
+        if self.views.is_shaded:
+            shading = tuple(map(read, ("color", "surface", "lighting", environment_of(self.shape))))
         self._add(
             "lightfield_synthesize",
             (
                 write("image"),
                 access("sum"),
                 access("seen"),
-                *map(read, ("winners", "color", "inv_depth", "cells", "views")),
+                *map(read, ("winners", self.color, "inv_depth", "cells", "views")),
                 *mips,
+                *shading,
                 self.size,
                 self.lens,
                 np.int32(first),

@@ -1,20 +1,25 @@
 """The light-field method end to end: its twin, its promises, and the paper's boundary cases."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cldof import Camera, InputError, LayeredFrame, Lens
+from cldof import Camera, InputError, LayeredFrame, Lens, Lighting
 from cldof.host.device import Device
 from cldof.lens import DiscAperture, PolygonAperture
 from cldof.methods import FrameShape
 from cldof.methods.lightfield import LightField, Views, _radical_inverse, lens_views
+from cldof.metrics import psnr
 from tests.frames import noise_frame, plane_frame
+from tests.opengl import require_opengl
 from tests.oracles import lightfield as oracle
+from tests.oracles import shading as shading_oracle
 from tests.running import render_frame
+from tests.shaded import LIGHTS, environment, mirrored_by, shaded_frame
 from tests.tolerances import assert_close
 
 PAPER = {"peels": 1, "support": "2x2", "lookup": "winner", "dither": False, "pattern": "halton"}
@@ -50,7 +55,44 @@ def twin(frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:
         support=method.support,
         lookup=method.lookup,
         cos4=float(plan.params["lens"]["cos4"]),
+        **(shading(frame, lens, method.lookup) if plan.summary["eyes"] else {}),
     )
+
+
+def shading(frame: LayeredFrame, lens: Lens, lookup: str) -> dict[str, Any]:
+    """How the twin shades what rays hit: the winner's surface, where the ray meets it, normals between pixels of it."""
+    assert frame.lighting is not None
+    normals = frame.surface["normal"].astype(np.float64)
+    with np.errstate(divide="ignore"):
+        inv_depth = np.float32(1.0) / frame.depth
+    cells = oracle.cells(inv_depth, frame.color[..., 3], *lens.coc_coefficients(frame.camera))
+    cells &= lookup == "bilinear"
+    focal, middle_x, middle_y = frame.inputs["lighting"][1, :3].astype(np.float64)
+    right, up, back, centre = frame.camera.pose[:3].T
+
+    def mirrored(hits: oracle.Hits, view: np.ndarray) -> np.ndarray:
+        at = hits.m, hits.y, hits.x
+        across = (hits.ray_x / 256 + 0.5 - middle_x) / focal
+        above = (middle_y - hits.ray_y / 256 - 0.5) / focal
+        ray = across[..., None] * right + above[..., None] * up - back
+        where = centre + ray / np.maximum(hits.inv_depth, 1e-9)[..., None]
+        eye = centre + lens.aperture_radius_m * (float(view[0]) * right - float(view[1]) * up)
+        f0 = frame.surface["specular"][at].astype(np.float64)
+        x, y = np.clip(hits.ray_x >> 8, 0, frame.width - 2), np.clip(hits.ray_y >> 8, 0, frame.height - 2)
+        fx, fy = ((ray & 255)[..., None] / 256 for ray in (hits.ray_x, hits.ray_y))
+        is_between = cells[hits.m, y, x] & (x == hits.ray_x >> 8) & (y == hits.ray_y >> 8)
+        is_between &= np.isin(hits.x - x, (0, 1)) & np.isin(hits.y - y, (0, 1))
+        above = normals[hits.m, y, x] * (1 - fx) + normals[hits.m, y, x + 1] * fx
+        below = normals[hits.m, y + 1, x] * (1 - fx) + normals[hits.m, y + 1, x + 1] * fx
+        normal = np.where(is_between[..., None], above * (1 - fy) + below * fy, normals[at])
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        normal = np.where(length > 1e-6, normal / np.maximum(length, 1e-6), 0.0)
+        rough = shading_oracle.roughness(frame.surface["shininess"][at].astype(np.float64))
+        return shading_oracle.specular(where, normal, f0, rough, eye, frame.lighting)
+
+    matte = frame.color.astype(np.float64)
+    matte[..., :3] = np.maximum(matte[..., :3] - matte[..., 3:] * mirrored_by(frame, (0.0, 0.0)), 0.0)
+    return {"mirrored": mirrored, "matte": matte}
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 29), (31, 1), (37, 21), (67, 34)])
@@ -89,6 +131,71 @@ def test_slanted_rays_are_weaker(device: Device) -> None:
     assert np.abs(image - render(device, frame, lens, cos4=False, **options)).max() > 1e-3
     flat = plane_frame(np.ones((20, 30, 4), np.float32), 1.3)
     np.testing.assert_allclose(render(device, flat, lens, **options), 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{}, {"peels": 1}, {"lookup": "winner", "support": "2x2"}])
+@pytest.mark.parametrize("around", [False, True], ids=["hemisphere", "environment"])
+def test_views_are_shaded_from_their_own_points(device: Device, options: dict, around: bool) -> None:
+    lighting = Lighting(LIGHTS.lights, LIGHTS.ambient, environment()) if around else LIGHTS
+    frame = shaded_frame(48, 37, lighting, guard_px=4)
+    lens = Lens(0.3, 2.0)
+    options = {"views": 5, "mip": False, **options}
+    image = render(device, frame, lens, **options)
+    assert_close(image, twin(frame, lens, **options), "lightfield_shaded")
+    assert np.abs(image - render(device, frame, lens, view_dependent=False, **options)).max() > 0.05
+
+
+def test_batches_of_shaded_views_give_the_same_bits(device: Device) -> None:
+    frame = shaded_frame(48, 37)
+    first = render(device, frame, Lens(0.1, 2.0), views=10)
+    for options in ({"memory_mb": 0.05}, {"warp": "atomic"}, {"cull": False}):
+        np.testing.assert_array_equal(render(device, frame, Lens(0.1, 2.0), views=10, **options), first)
+
+
+def test_only_what_is_glossy_pays_for_shading(device: Device) -> None:
+    """Without lighting, with nothing that mirrors, through a pinhole or if told so: no pass and no bit is different."""
+    glossy = shaded_frame(48, 37)
+    matte = {**glossy.surface, "specular": np.zeros_like(glossy.surface["specular"])}
+    plain = LayeredFrame(glossy.color, glossy.depth, glossy.camera)
+    still = LayeredFrame(glossy.color, glossy.depth, glossy.camera, lighting=glossy.lighting, **matte)
+    lens = Lens(0.1, 2.0)
+    expected = render(device, plain, lens)
+    np.testing.assert_array_equal(render(device, still, lens), expected)
+    np.testing.assert_array_equal(render(device, glossy, lens, view_dependent=False), expected)
+    np.testing.assert_array_equal(render(device, glossy, Lens(0.0, 2.0)), render(device, plain, Lens(0.0, 2.0)))
+
+    def kernels(frame: LayeredFrame, lens: Lens, **options) -> set[str]:
+        method = LightField(**options)
+        program = method.program(FrameShape.of(frame), method.plan(frame, lens), device.traits)
+        return {step.kernel for step in program.passes}
+
+    assert "shading_split" in kernels(glossy, lens)
+    for frame, radius, options in ((still, 0.1, {}), (glossy, 0.0, {}), (glossy, 0.1, {"view_dependent": False})):
+        assert "shading_split" not in kernels(frame, Lens(radius, 2.0), **options)
+
+
+def test_highlights_move_with_the_lens(device: Device) -> None:
+    """A polished floor under lamps, against the reference that shades every view from its own point."""
+    require_opengl()
+    from cldof.capture.accumulate import accumulate
+    from cldof.capture.peel import DepthPeeler
+    from cldof.capture.scenes import builtin_scene
+
+    scene = builtin_scene("floor")
+    camera = scene.camera_for(144, 144)
+    assert scene.aperture_radius_m is not None
+    assert scene.focus_distance_m is not None
+    lens = Lens(scene.aperture_radius_m, scene.focus_distance_m)
+    with DepthPeeler(144, 144) as peeler:
+        frame = peeler.peel(scene, camera, layers=3, lens=lens, guard_px=5, surface=True)
+        reference = accumulate(peeler, scene, camera, lens, 64, "disc", noise_floor=False).image
+
+    for peels, gain in ((None, 1.0), (1, 0.5)):
+        shaded, still = (
+            psnr(render(device, frame, lens, peels=peels, views=64, view_dependent=flag), reference)
+            for flag in (True, False)
+        )
+        assert shaded > still + gain
 
 
 @pytest.mark.parametrize("opaque", [True, False], ids=["opaque", "void"])

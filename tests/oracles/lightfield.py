@@ -4,6 +4,7 @@ Positions are whole 1/256 px, made from one float32 product each, as kernels/lig
 pixel is then the same to the last bit. Everything else is in float64.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -207,26 +208,58 @@ def warp(some: Slots, view: np.ndarray, size: tuple[int, int], planes: int, guar
     return winners
 
 
+def cells(inv_depth: np.ndarray, alpha: np.ndarray, c1: float, c0: float) -> np.ndarray:
+    """Whether a pixel and those right, below and both are one surface, (M, H, W)."""
+    height, width = inv_depth.shape[1:]
+    result = np.zeros(inv_depth.shape, bool)
+    c, opaque = coc(inv_depth, c1, c0), alpha >= OPAQUE
+    own = np.s_[:, : height - 1, : width - 1]
+    result[own] = inv_depth[own] >= 0
+    limit = 0.5 + 0.125 * np.abs(c[own])
+    for dy, dx in ((0, 1), (1, 0), (1, 1)):
+        other = np.s_[:, dy : height - 1 + dy, dx : width - 1 + dx]
+        result[own] &= (inv_depth[other] >= 0) & (np.abs(c[other] - c[own]) <= limit) & (opaque[other] == opaque[own])
+    return result
+
+
+class Hits(NamedTuple):
+    """Where the rays of a view meet the layers, (H, W) each; what holes have means nothing."""
+
+    m: np.ndarray
+    y: np.ndarray
+    x: np.ndarray
+    inv_depth: np.ndarray
+    coc: np.ndarray
+    ray_x: np.ndarray  # 1/256 px
+    ray_y: np.ndarray
+
+
+def _hits(
+    inv_depth: np.ndarray, winner: np.ndarray, view: np.ndarray, c1: float, c0: float, pitch: int, guard: int
+) -> Hits:
+    rows = inv_depth.shape[1]
+    height, width = winner.shape
+    source = (winner & np.uint64(NONE)).astype(np.int64)
+    line, x = source // pitch, source % pitch
+    m, y, x = (np.where(source == NONE, 0, n) for n in (line // rows, line % rows, x))
+    w = inv_depth[m, y, x]
+    c = coc(w, c1, c0)
+    gy, gx = np.mgrid[:height, :width]
+    ray_x = 256 * (gx + guard) - _product(c, np.float32(256) * view[0])
+    ray_y = 256 * (gy + guard) - _product(c, np.float32(256) * view[1])
+    return Hits(m, y, x, w, c, ray_x, ray_y)
+
+
 def _look_up(
     color: np.ndarray, inv_depth: np.ndarray, winner: np.ndarray, view: np.ndarray, c1: float, c0: float,
     pitch: int, guard: int, lookup: str, glass: bool,
 ) -> np.ndarray:  # fmt: skip
     """Colours of the rays of a view, (H, W, 4)."""
     rows, columns = inv_depth.shape[1:]
-    height, width = winner.shape
-    source = (winner & np.uint64(NONE)).astype(np.int64)
-    line, x = source // pitch, source % pitch
-    m, y = line // rows, line % rows
-    hole = source == NONE
-    m, y, x = (np.where(hole, 0, n) for n in (m, y, x))
+    m, y, x, w, c, ray_x, ray_y = _hits(inv_depth, winner, view, c1, c0, pitch, guard)
     base = color[m, y, x]
     if lookup == "winner":
         return base
-    w = inv_depth[m, y, x]
-    c = coc(w, c1, c0)
-    gy, gx = np.mgrid[:height, :width]
-    ray_x = 256 * (gx + guard) - _product(c, np.float32(256) * view[0])
-    ray_y = 256 * (gy + guard) - _product(c, np.float32(256) * view[1])
     step_x, step_y = np.where(ray_x < 256 * x, -1, 1), np.where(ray_y < 256 * y, -1, 1)
     fx = np.minimum(np.abs(ray_x - 256 * x), 256)[..., None] / 256
     fy = np.minimum(np.abs(ray_y - 256 * y), 256)[..., None] / 256
@@ -256,8 +289,21 @@ def _look_up(
 def render(
     color: np.ndarray, inv_depth: np.ndarray, views: np.ndarray, c1: float, c0: float, *, pitch: int, guard: int,
     glass: bool, void: bool = False, support: str = "surface", lookup: str = "bilinear", cos4: float = 0.0,
+    mirrored: Callable[[Hits, np.ndarray], np.ndarray] | None = None, matte: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """A whole frame without mip levels; layers (M, H, W, 4) and (M, H, W) with -1 where nothing is."""
+    """A whole frame without mip levels; layers (M, H, W, 4) and (M, H, W) with -1 where nothing is.
+
+    With ``mirrored`` rays look up ``matte`` and add what is mirrored where they hit, (H, W, 3), towards a view.
+    """
+
+    def rays(winner: np.ndarray, view: np.ndarray) -> np.ndarray:
+        looked_at = color if matte is None else matte
+        found = _look_up(looked_at, inv_depth, winner, view, c1, c0, pitch, guard, lookup, glass)
+        if mirrored is not None:
+            found = found.copy()
+            found[..., :3] += found[..., 3:] * mirrored(_hits(inv_depth, winner, view, c1, c0, pitch, guard), view)
+        return found
+
     planes = 3 if glass else 1
     size = (color.shape[1] - 2 * guard, color.shape[2] - 2 * guard)
     color = color.astype(np.float64)
@@ -270,10 +316,10 @@ def render(
         image = np.zeros((*size, 4))
         for winner in np.sort(winners[1:], axis=0):
             there = (winner & np.uint64(NONE) != NONE) & (winner < solid)
-            found = _look_up(color, inv_depth, winner, view, c1, c0, pitch, guard, lookup, glass)
+            found = rays(winner, view)
             image += np.where(there[..., None], (1.0 - image[..., 3:]) * found, 0.0)
         there = solid & np.uint64(NONE) != NONE
-        found = _look_up(color, inv_depth, solid, view, c1, c0, pitch, guard, lookup, glass)
+        found = rays(solid, view)
         image += np.where(there[..., None], (1.0 - image[..., 3:]) * found, 0.0)
         total += weight * image
         # Behind the last peel's glass no slot stands for the void.
