@@ -38,6 +38,19 @@ __kernel void probe(__global uint *out, __local uint *tile)
 }
 """
 
+# Items compete for four places; which of them wins depends on both words of the keys.
+_INT64_EXTENSION = "cl_khr_int64_extended_atomics"
+_INT64_SOURCE = f"""
+#pragma OPENCL EXTENSION {_INT64_EXTENSION} : enable
+__kernel void probe(__global ulong *out)
+{{
+    uint i = get_global_id(0);
+    ulong key = (ulong)(0xfffffff0u - (i >> 4)) << 32 | (i * 2654435761u);
+    atom_min(out + (i & 3u), key);
+}}
+"""
+_INT64_ITEMS = 1024
+
 
 @dataclass(frozen=True)
 class DeviceInfo:
@@ -85,7 +98,7 @@ class Traits:
     supports_out_of_order : bool
         A queue may run commands in any order that events allow.
     has_int64_atomics : bool
-        The extensions for 64-bit ``atom_add`` and ``atom_min`` are there. Claimed, not probed.
+        ``atom_min`` on ulong works: claimed, built and run with the right result.
     """
 
     is_cpu: bool
@@ -241,7 +254,6 @@ class Device:
     def traits(self) -> Traits:
         """What code may branch on; the first look runs a tiny kernel."""
         device = self._cl_device
-        extensions = device.extensions.split()
         return Traits(
             is_cpu=self.info.kind == "cpu",
             name=self.info.name,
@@ -255,7 +267,7 @@ class Device:
             preferred_group_limit=min(usable, _PREFERRED_GROUP_LIMIT),
             host_unified_memory=self.pool.shares_memory,
             supports_out_of_order=_supports_out_of_order(device),
-            has_int64_atomics={"cl_khr_int64_base_atomics", "cl_khr_int64_extended_atomics"} <= set(extensions),
+            has_int64_atomics=self._int64_atomics_work(),
         )
 
     def finish(self) -> None:
@@ -282,12 +294,41 @@ class Device:
     ) -> None:
         self.close()
 
+    def _probe(self, source: str) -> Any:
+        """The kernel of a probe."""
+        program = cl._cl._Program(self.context, source)
+        program._build(options=b"", devices=[self._cl_device])
+        return cl.Kernel(program, "probe")
+
+    def _int64_atomics_work(self) -> bool:
+        """Whether atomic minima on 64 bits are claimed, compile, and are right when many compete for one place."""
+        if _INT64_EXTENSION not in self._cl_device.extensions.split():
+            return False
+        item = np.arange(_INT64_ITEMS, dtype=np.uint64)
+        low = item * np.uint64(2654435761) & np.uint64(0xFFFFFFFF)
+        keys = (np.uint64(0xFFFFFFF0) - (item >> np.uint64(4))) << np.uint64(32) | low
+        try:
+            kernel = self._probe(_INT64_SOURCE)
+            buffer = self.pool.acquire(4 * 8)
+        except (DeviceError, cl.Error):
+            return False
+        try:
+            fill = launch(self.queue, "probe", cl.enqueue_fill_buffer, buffer, b"\xff" * 8, 0, 4 * 8).event
+            kernel.set_arg(0, buffer)
+            done = launch(
+                self.queue, "probe", cl.enqueue_nd_range_kernel, kernel, (_INT64_ITEMS,), None, waits=[fill]
+            ).event
+            found = self.pool.to_host(buffer, (4,), np.uint64, waits=[done])
+            return bool((found == keys.reshape(-1, 4).min(axis=0)).all())
+        except (DeviceError, cl.Error):
+            return False
+        finally:
+            self.pool.release(buffer)
+
     def _usable_group_size(self) -> int:
         """Halve the driver's claim until a kernel with a barrier gives the right answer."""
-        program = cl._cl._Program(self.context, _PROBE_SOURCE)
         try:
-            program._build(options=b"", devices=[self._cl_device])
-            kernel = cl.Kernel(program, "probe")
+            kernel = self._probe(_PROBE_SOURCE)
         except cl.Error as error:
             advice = ""
             if Effect.DRIVER_CACHES_BUILDS in effects_of(self.info.platform, self.info.name):

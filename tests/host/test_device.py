@@ -76,6 +76,66 @@ def test_work_group_size_is_probed_not_believed(device: Device, monkeypatch: pyt
     assert device._usable_group_size() == max(claimed // 4, 1)
 
 
+def claim_int64(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
+    """Have the device claim 64-bit atomics, whatever it can do."""
+
+    class Claiming:
+        extensions = device._cl_device.extensions + " cl_khr_int64_extended_atomics"
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(device._cl_device, name)
+
+    claiming = Claiming()
+    probe = device._probe
+
+    def build(source: str) -> object:
+        monkeypatch.setattr(device, "_cl_device", real)
+        return probe(source)
+
+    real = device._cl_device
+    monkeypatch.setattr(device, "_cl_device", claiming)
+    monkeypatch.setattr(device, "_probe", build)
+
+
+def test_int64_atomics_need_the_claim(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    claims = "cl_khr_int64_extended_atomics" in device._cl_device.extensions.split()
+    assert claims or not device.traits.has_int64_atomics
+    monkeypatch.setattr(device_module, "_INT64_EXTENSION", "cl_khr_nobody_has_this")
+    assert not device._int64_atomics_work()
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ("atom_min", "no_such_builtin"),  # does not build
+        ("atom_min(out + (i & 3u), key)", "if (key < out[i & 3u]) out[i & 3u] = 1ul"),  # wrong
+        ("<< 32", "<< 24"),  # the upper word is lost
+        ("__kernel void probe", "__kernel void another"),  # no kernel
+    ],
+)
+def test_a_driver_that_claims_and_fails_has_no_int64_atomics(
+    device: Device, monkeypatch: pytest.MonkeyPatch, right: str, wrong: str
+) -> None:
+    claim_int64(monkeypatch, device)
+    source = device_module._INT64_SOURCE
+    assert right in source
+    monkeypatch.setattr(device_module, "_INT64_SOURCE", source.replace(right, wrong))
+    assert not device._int64_atomics_work()
+
+
+def test_a_failing_queue_is_no_int64_atomics(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not device.traits.has_int64_atomics:
+        pytest.skip(f"{device.info.name} has no 64-bit atomics")
+
+    def fail(*arguments: object, **options: object) -> None:
+        raise DeviceError("out of resources")
+
+    monkeypatch.setattr(device_module, "launch", fail)
+    assert not device._int64_atomics_work()
+    monkeypatch.undo()
+    assert device._int64_atomics_work()
+
+
 def test_queue_kinds(device_info: DeviceInfo, open_device: Callable[..., Device]) -> None:
     plain = open_device(device_info)
     assert (plain.is_profiling, plain.is_out_of_order) == (False, False)

@@ -1,6 +1,7 @@
 """The light-field method end to end: its twin, its promises, and the paper's boundary cases."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -475,6 +476,24 @@ def test_memory_is_eight_bytes_a_pixel_and_view() -> None:
         assert winners(views=views) == views * 64 * 48 * 8
     assert winners(views=36, memory_mb=0.1) == 4 * 64 * 48 * 8
     assert winners(views=36, memory_mb=1e-3) == 64 * 48 * 8
+
+
+@pytest.mark.parametrize(
+    ("is_cpu", "has_int64_atomics", "kernels"),
+    [
+        (True, True, {"lightfield_views"}),
+        (True, False, {"lightfield_views"}),
+        (False, True, {"lightfield_clear", "lightfield_packed"}),
+        (False, False, {"lightfield_clear", "lightfield_depths", "lightfield_sources"}),
+    ],
+)
+def test_the_warp_follows_the_device(device: Device, is_cpu: bool, has_int64_atomics: bool, kernels: set) -> None:
+    frame = noise_frame(64, 48, 2)
+    method = LightField()
+    traits = replace(device.traits, is_cpu=is_cpu, has_int64_atomics=has_int64_atomics)
+    program = method.program(FrameShape.of(frame), method.plan(frame, lens_for(frame, 10.0)), traits)
+    warps = {"lightfield_views", "lightfield_clear", "lightfield_packed", "lightfield_depths", "lightfield_sources"}
+    assert {step.kernel for step in program.passes} & warps == kernels
 
 
 def test_halton_views() -> None:
