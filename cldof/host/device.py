@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DeviceError
 from . import opencl as cl
@@ -50,6 +51,17 @@ __kernel void probe(__global ulong *out)
 }}
 """
 _INT64_ITEMS = 1024
+
+# More turns than Mesa's llvmpipe gives all loops of a work-item together, which is 65535; then it leaves them silently.
+_LOOP_TURNS = 1 << 18
+_LOOP_SOURCE = """
+__kernel void probe(__global uint *out, uint turns)
+{
+    uint sum = 0u;
+    for (uint i = 0u; i < turns; i++) sum += out[1u + (i & 1u)];
+    out[0] = sum;
+}
+"""
 
 
 @dataclass(frozen=True)
@@ -99,6 +111,8 @@ class Traits:
         A queue may run commands in any order that events allow.
     has_int64_atomics : bool
         ``atom_min`` on ulong works: claimed, built and run with the right result.
+    has_long_loops : bool
+        The loops of a work-item may take more than 65535 turns. Found by running one that does.
     """
 
     is_cpu: bool
@@ -114,6 +128,7 @@ class Traits:
     host_unified_memory: bool
     supports_out_of_order: bool
     has_int64_atomics: bool
+    has_long_loops: bool
 
 
 def list_devices() -> list[DeviceInfo]:
@@ -268,6 +283,7 @@ class Device:
             host_unified_memory=self.pool.shares_memory,
             supports_out_of_order=_supports_out_of_order(device),
             has_int64_atomics=self._int64_atomics_work(),
+            has_long_loops=self._long_loops_work(),
         )
 
     def finish(self) -> None:
@@ -307,21 +323,27 @@ class Device:
         item = np.arange(_INT64_ITEMS, dtype=np.uint64)
         low = item * np.uint64(2654435761) & np.uint64(0xFFFFFFFF)
         keys = (np.uint64(0xFFFFFFF0) - (item >> np.uint64(4))) << np.uint64(32) | low
+        found = self._probed(_INT64_SOURCE, np.full(4, ~np.uint64(0)), _INT64_ITEMS)
+        return found is not None and bool((found == keys.reshape(-1, 4).min(axis=0)).all())
+
+    def _long_loops_work(self) -> bool:
+        found = self._probed(_LOOP_SOURCE, np.array([0, 1, 1], np.uint32), 1, np.uint32(_LOOP_TURNS))
+        return found is not None and int(found[0]) == _LOOP_TURNS
+
+    def _probed(self, source: str, start: NDArray[Any], items: int, *scalars: Any) -> NDArray[Any] | None:
+        """What a probe makes of its buffer; None if the driver cannot run it."""
         try:
-            kernel = self._probe(_INT64_SOURCE)
-            buffer = self.pool.acquire(4 * 8)
+            kernel = self._probe(source)
+            buffer = self.pool.acquire(start.nbytes)
         except (DeviceError, cl.Error):
-            return False
+            return None
         try:
-            fill = launch(self.queue, "probe", cl.enqueue_fill_buffer, buffer, b"\xff" * 8, 0, 4 * 8).event
-            kernel.set_arg(0, buffer)
-            done = launch(
-                self.queue, "probe", cl.enqueue_nd_range_kernel, kernel, (_INT64_ITEMS,), None, waits=[fill]
-            ).event
-            found = self.pool.to_host(buffer, (4,), np.uint64, waits=[done])
-            return bool((found == keys.reshape(-1, 4).min(axis=0)).all())
+            written = launch(self.queue, "probe", cl.enqueue_copy, buffer, start).event
+            kernel.set_args(buffer, *scalars)
+            done = launch(self.queue, "probe", cl.enqueue_nd_range_kernel, kernel, (items,), None, waits=[written])
+            return self.pool.to_host(buffer, start.shape, start.dtype, waits=[done.event])
         except (DeviceError, cl.Error):
-            return False
+            return None
         finally:
             self.pool.release(buffer)
 

@@ -114,7 +114,8 @@ class LightField:
         further batches; the picture is the same.
     warp : {"auto", "views", "atomic", "packed"}
         One work-item a view without atomics, 32-bit atomics in two steps, or 64-bit atomics; all give the same bits.
-        "auto" takes the first on CPUs, elsewhere the last where a probe finds 64-bit atomics, else the second.
+        "auto" takes the first on CPUs (where loops may be long), else the last where a probe finds 64-bit atomics work,
+        else the second.
     seed : int
         Of the lens points.
     cull : bool
@@ -167,14 +168,13 @@ class LightField:
         if not frame.is_opaque:
             farthest = 0.0  # the void is a surface at infinity
         largest = max(abs(c1 * farthest + c0), abs(c1 * nearest + c0))
-        count = self.views if largest >= _NEGLIGIBLE_COC_PX else 1
+        is_shaded = self.view_dependent and frame.lobe_turn_per_m * lens.aperture_radius_m > _LEAST_TURN
+        count = self.views if largest >= _NEGLIGIBLE_COC_PX or is_shaded else 1
         # A ray's share of the CoC is pi C^2 / views; a level of the pyramid is as wide as a box of twice its texels.
         cell = math.sqrt(math.pi / count) / 2.0
         levels = 0
         if self.mip and largest > 0.0:
             levels = min(max(0, round(math.log2(largest * cell))), _MAX_LEVELS)
-        turn = frame.lobe_turn_per_m * lens.aperture_radius_m
-        is_shaded = self.view_dependent and count > 1 and turn > _LEAST_TURN
         focal_m = (lens.focal_length_mm or 0.0) * 1e-3
         params = np.zeros((), _LENS)
         params["c1"], params["c0"], params["cell"] = c1, c0, cell
@@ -254,7 +254,7 @@ def _radical_inverse(index: NDArray[np.integer[Any]], base: int) -> NDArray[np.f
 
 def _fastest_warp(traits: Traits) -> str:
     """A view fits a CPU core's cache, where atomics take six times as long; others take as few passes as they can."""
-    if traits.is_cpu:
+    if traits.is_cpu and traits.has_long_loops:
         return "views"
     return "packed" if traits.has_int64_atomics else "atomic"
 
@@ -301,6 +301,10 @@ class _Builder:
         warp = method.warp if method.warp != "auto" else _fastest_warp(traits)
         if warp == "packed" and not traits.has_int64_atomics:
             raise InputError(f"lightfield: warp='packed' needs 64-bit atomics, which {traits.name} does not have.")
+        if warp == "views" and not traits.has_long_loops:
+            raise InputError(
+                f"lightfield: warp='views' needs loops that {traits.name} breaks off; take 'atomic' or 'auto'."
+            )
         self.warp = warp
         self.defines = (
             ("LIGHTFIELD_SUPPORT", _SUPPORTS.index(method.support)),

@@ -123,6 +123,20 @@ def test_a_driver_that_claims_and_fails_has_no_int64_atomics(
     assert not device._int64_atomics_work()
 
 
+@pytest.mark.parametrize(
+    ("right", "wrong"), [("i < turns", "i < turns && i < 65535u"), ("uint sum", "no_such_type sum")]
+)
+def test_loops_that_are_broken_off_are_found(
+    device: Device, monkeypatch: pytest.MonkeyPatch, right: str, wrong: str
+) -> None:
+    """As llvmpipe does."""
+    assert device._long_loops_work() == device.traits.has_long_loops
+    source = device_module._LOOP_SOURCE
+    assert right in source
+    monkeypatch.setattr(device_module, "_LOOP_SOURCE", source.replace(right, wrong))
+    assert not device._long_loops_work()
+
+
 def test_a_failing_queue_is_no_int64_atomics(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     if not device.traits.has_int64_atomics:
         pytest.skip(f"{device.info.name} has no 64-bit atomics")

@@ -30,6 +30,12 @@ def render(device: Device, frame: LayeredFrame, lens: Lens, **options) -> np.nda
     return render_frame(device, LightField(**options), frame, lens)
 
 
+def forms_of(device: Device) -> list[str]:
+    """The warps that a device can do."""
+    can = {"views": device.traits.has_long_loops, "atomic": True, "packed": device.traits.has_int64_atomics}
+    return [form for form, does in can.items() if does]
+
+
 def lens_for(frame: LayeredFrame, coc_px: float, focus_m: float = 2.0, **more) -> Lens:
     """CoC radius at infinity is ``coc_px / focus_m``."""
     return Lens(coc_px / frame.camera.focal_px, focus_m, **more)
@@ -207,9 +213,9 @@ def test_forms_batches_and_culling_give_the_same_bits(device: Device, opaque: bo
     frame = noise_frame(75, 43, 3, opaque=opaque, guard_px=3)
     lens = lens_for(frame, 26.0)
     options = {"views": 10, "lookup": lookup, "mip": mip}
-    first = render(device, frame, lens, warp="views", **options)
+    first = render(device, frame, lens, **options)
     view_mb = 3 * 43 * 80 * 8 / 1e6
-    forms = ["views", "atomic", *(["packed"] if device.traits.has_int64_atomics else [])]
+    forms = forms_of(device)
     for warp in forms:
         for memory in (1000.0, 3.5 * view_mb, 1e-6):
             other = render(device, frame, lens, warp=warp, memory_mb=memory, **options)
@@ -414,7 +420,7 @@ def test_same_input_same_bits(device: Device) -> None:
     frame = noise_frame(100, 50, opaque=False)
     lens = lens_for(frame, 20.0)
     first = render(device, frame, lens)
-    for warp in ("views", "atomic"):
+    for warp in forms_of(device):
         for _ in range(3):
             np.testing.assert_array_equal(render(device, frame, lens, warp=warp), first)
 
@@ -438,6 +444,7 @@ def test_random_frames_keep_the_promises(
     focus: float, support: str, lookup: str, warp: str,
 ) -> None:  # fmt: skip
     frame = noise_frame(width, height, layers, seed=seed, opaque=opaque, guard_px=guard)
+    warp = warp if warp in forms_of(device) else "auto"
     options = {"support": support, "lookup": lookup, "warp": warp, "views": 9}
     out = render(device, frame, lens_for(frame, aperture_px, focus), **options)
     assert np.isfinite(out).all()
@@ -460,6 +467,7 @@ def test_memory_is_eight_bytes_a_pixel_and_view() -> None:
 
     class Traits:
         is_cpu, compute_units, max_alloc_bytes, has_int64_atomics, name = True, 2, 1 << 40, False, ""
+        has_long_loops = True
 
     frame = noise_frame(64, 48, 2)
     lens = lens_for(frame, 10.0)
@@ -479,18 +487,22 @@ def test_memory_is_eight_bytes_a_pixel_and_view() -> None:
 
 
 @pytest.mark.parametrize(
-    ("is_cpu", "has_int64_atomics", "kernels"),
+    ("is_cpu", "has_int64_atomics", "has_long_loops", "kernels"),
     [
-        (True, True, {"lightfield_views"}),
-        (True, False, {"lightfield_views"}),
-        (False, True, {"lightfield_clear", "lightfield_packed"}),
-        (False, False, {"lightfield_clear", "lightfield_depths", "lightfield_sources"}),
+        (True, True, True, {"lightfield_views"}),
+        (True, False, True, {"lightfield_views"}),
+        (True, False, False, {"lightfield_clear", "lightfield_depths", "lightfield_sources"}),
+        (False, True, True, {"lightfield_clear", "lightfield_packed"}),
+        (False, False, True, {"lightfield_clear", "lightfield_depths", "lightfield_sources"}),
     ],
 )
-def test_the_warp_follows_the_device(device: Device, is_cpu: bool, has_int64_atomics: bool, kernels: set) -> None:
+def test_the_warp_follows_the_device(
+    device: Device, is_cpu: bool, has_int64_atomics: bool, has_long_loops: bool, kernels: set
+) -> None:
     frame = noise_frame(64, 48, 2)
     method = LightField()
-    traits = replace(device.traits, is_cpu=is_cpu, has_int64_atomics=has_int64_atomics)
+    can = {"has_int64_atomics": has_int64_atomics, "has_long_loops": has_long_loops}
+    traits = replace(device.traits, is_cpu=is_cpu, **can)
     program = method.program(FrameShape.of(frame), method.plan(frame, lens_for(frame, 10.0)), traits)
     warps = {"lightfield_views", "lightfield_clear", "lightfield_packed", "lightfield_depths", "lightfield_sources"}
     assert {step.kernel for step in program.passes} & warps == kernels
