@@ -175,11 +175,17 @@ class LayeredFrame:
             transmittance = transmittance * (1.0 - layer[..., 3])
         return not bool((transmittance > _OPAQUE_TOLERANCE).any())
 
-    @cached_property
+    @property
     def has_glass(self) -> bool:
         """True when some slot lets part of what is behind it through: alpha neither 0 nor 1."""
+        return self.panes > 0
+
+    @cached_property
+    def panes(self) -> int:
+        """Slots that let part of what is behind them through: the most in any column."""
         alpha = self.color[..., 3]
-        return bool(((alpha > 0.0) & (alpha < 1.0 - _OPAQUE_TOLERANCE)).any())
+        glass = (alpha > 0.0) & (alpha < 1.0 - _OPAQUE_TOLERANCE)
+        return int(glass.sum(axis=0, dtype=np.uint8).max())
 
     @cached_property
     def is_glossy(self) -> bool:

@@ -26,7 +26,7 @@
 #ifndef LIGHTFIELD_SUPPORT
 #define LIGHTFIELD_SUPPORT 3
 #endif
-/* 1: some slots are glass, and there are planes beside the first. */
+/* Panes of glass in a column that keep apart: planes beside the first. 0: there is no glass. */
 #ifndef LIGHTFIELD_GLASS
 #define LIGHTFIELD_GLASS 0
 #endif
@@ -77,7 +77,6 @@
 #define SEGMENT 32           /* pixels of a row that one item of lightfield_synthesize makes */
 #define MIN_WEIGHT 1e-4f     /* of all views together: less is a pixel that no view sees */
 #define LANES ((int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
-#define MAX_PLANES 4         /* plane 0 and three of glass */
 
 typedef struct {
     int width, height, pitch, peels;            /* of the layers, guard band included */
@@ -1014,9 +1013,9 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
             /* Rays that meet glass before what hides the rest: the panes over one another, then what is behind. A hole
              * behind glass counts as far as the glass covers it; or, if the frame lets the void through, as the void:
              * behind the last peel there is no slot for it. */
-            float4 panes[MAX_PLANES][16];
-            uint2 pane_hits[MAX_PLANES][16];
-            int has_pane[MAX_PLANES];
+            float4 panes[LIGHTFIELD_GLASS + 1][16];
+            uint2 pane_hits[LIGHTFIELD_GLASS + 1][16];
+            int has_pane[LIGHTFIELD_GLASS + 1];
             if (!RAYS_OF(found, hits, 0))
                 for (int i = 0; i < end; i++) hits[i] = (uint2)(NONE);
             for (int p = 1; p < size.planes; p++) has_pane[p] = RAYS_OF(panes[p], pane_hits[p], p);

@@ -44,7 +44,7 @@ _SUPPORTS = ("none", "2x2", "3x3", "surface")
 _LOOKUPS = ("winner", "bilinear", "jitter")
 
 # Panes of glass one behind the other that keep apart when warped; more fall together, the nearest of them winning.
-_GLASS_PLANES = 2
+_MOST_PANES = 8
 # A footprint reaches this far beyond half a pixel: steep edges, 4 px, and what rounding adds.
 _FOOTPRINT_PX = 6
 _MAX_LEVELS = 5
@@ -83,6 +83,7 @@ class Views(NamedTuple):
     aperture: Aperture
     levels: int  # of the mip pyramid, above the layers
     is_shaded: bool = False  # from the views' own points
+    panes: int = 0  # of glass, one behind the other
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,9 @@ class LightField:
             "eyes": count if is_shaded else 0,
             "largest_coc_px": largest,
         }
-        return Plan(Views(count, lens.aperture, levels, is_shaded), {"lens": params[()]}, summary)
+        panes = min(frame.panes, self.peels or frame.panes, _MOST_PANES)
+        structure = Views(count, lens.aperture, levels, is_shaded, panes)
+        return Plan(structure, {"lens": params[()]}, summary)
 
     def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality | None:
         """Slots move by their CoC.
@@ -267,7 +270,7 @@ class _Builder:
         self.peels = min(shape.layers, method.peels or shape.layers)
         self.out_height, self.out_width = shape.output_size
         self.out_pitch = row_pitch(self.out_width)
-        self.planes = 1 + (_GLASS_PLANES if shape.has_glass else 0)
+        self.planes = 1 + views.panes
         self.tiles = (-(-shape.width // _TILE), self.peels * -(-shape.height // _TILE))
         self.size = struct_scalar(
             _SIZE, shape.width, shape.height, shape.pitch, self.peels, self.out_width, self.out_height, self.out_pitch,
@@ -308,7 +311,7 @@ class _Builder:
         self.warp = warp
         self.defines = (
             ("LIGHTFIELD_SUPPORT", _SUPPORTS.index(method.support)),
-            ("LIGHTFIELD_GLASS", int(shape.has_glass)),
+            ("LIGHTFIELD_GLASS", views.panes),
             ("LIGHTFIELD_VOID", int(not shape.is_opaque)),
             ("LIGHTFIELD_LOOKUP", _LOOKUPS.index(method.lookup)),
             ("LIGHTFIELD_LEVELS", views.levels),

@@ -40,7 +40,7 @@ def layers(width: int, height: int, seed: int = 0, peels: int = 3) -> tuple[np.n
 
 
 def builder_for(device: Device, shape: FrameShape, method: LightField, views: int) -> _Builder:
-    structure = Views(views, DiscAperture(), 0)
+    structure = Views(views, DiscAperture(), 0, panes=2 if shape.has_glass else 0)
     builder = _Builder(method, shape, structure, device.traits)
     builder.passes = []
     return builder

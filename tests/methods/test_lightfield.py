@@ -253,11 +253,10 @@ def test_aperture_zero_is_the_pinhole_image(device: Device) -> None:
     image[..., 3] = 1.0
     np.testing.assert_array_equal(render(device, plane_frame(image, 3.0), Lens(0.0, 2.0)), image)
     for opaque in (True, False):
-        frame = noise_frame(61, 47, opaque=opaque, guard_px=3)
-        # Three panes in a column are more than there are planes for.
-        glass = ((frame.color[..., 3] > 0) & (frame.color[..., 3] < 0.999)).sum(axis=0)[3:-3, 3:-3]
+        frame = noise_frame(61, 47, 6, opaque=opaque, guard_px=3, seed=3)
         out = render(device, frame, Lens(0.0, 2.0))
-        np.testing.assert_allclose(out[glass < 3], frame.pinhole_image()[glass < 3], atol=1e-6)
+        assert frame.panes >= 3
+        np.testing.assert_allclose(out, frame.pinhole_image(), atol=1e-6)
 
 
 @pytest.mark.parametrize("depth", [0.3, 1.0, 1.99, 2.01, 7.0, math.inf])

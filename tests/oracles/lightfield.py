@@ -304,7 +304,8 @@ def render(
             found[..., :3] += found[..., 3:] * mirrored(_hits(inv_depth, winner, view, c1, c0, pitch, guard), view)
         return found
 
-    planes = 3 if glass else 1
+    alpha = color[..., 3].astype(np.float32)
+    planes = 1 + int(((alpha > 0) & (alpha < OPAQUE)).sum(axis=0).max()) if glass else 1
     size = (color.shape[1] - 2 * guard, color.shape[2] - 2 * guard)
     color = color.astype(np.float64)
     some = slots(inv_depth, color[..., 3].astype(np.float32), pitch, c1, c0, planes, support)
