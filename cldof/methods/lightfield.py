@@ -197,7 +197,7 @@ class LightField:
     def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality | None:
         """Slots move by their CoC.
 
-        Random pixels and what mirrors depend on their place in the image, and panes in focus, or what is in focus before
+        Random pixels and mirrors depend on their place in the image, and panes in focus, or what is in focus before
         the void, are not quite what a pinhole sees.
         """
         views = plan.structure
