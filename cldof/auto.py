@@ -263,6 +263,10 @@ class Choice:
     meets_budget : bool
         Whether the prediction keeps the budget.
     reason : str
+    fades_from : Setting or None
+        The setting of the frames before, while the image passes from it to this one.
+    share : float
+        Of this setting in the image.
     """
 
     setting: Setting
@@ -271,6 +275,8 @@ class Choice:
     uncertainty_db: float
     meets_budget: bool
     reason: str
+    fades_from: Setting | None = None
+    share: float = 1.0
 
     @property
     def predicted_rms(self) -> float:
@@ -288,6 +294,8 @@ class Choice:
             "uncertainty_db": self.uncertainty_db,
             "meets_budget": self.meets_budget,
             "reason": self.reason,
+            "fades_from": None if self.fades_from is None else str(self.fades_from),
+            "share": self.share,
         }
 
 
@@ -462,6 +470,8 @@ _HEADROOM, _LATER_HEADROOM = 0.25, 0.08
 _REMEMBERED = 5
 # Frames in a row for which another setting has to be better by this much before it is taken.
 _PATIENCE, _CHEAPER, _BETTER_DB = 12, 0.8, 1.0
+# Frames in which an image passes from one setting to the next, so that the change does not show.
+_FADE = 8
 # What runs may be expected to be this much worse than what would be taken anew.
 _LENIENCE_DB = 1.0
 # Settings within this of the least error are as good, and the cheapest of them is taken.
@@ -482,6 +492,7 @@ class Chooser:
     def __init__(self, curves: Curves, budget: Budget, copy_ms: float) -> None:
         self.curves, self.budget, self.copy_ms = curves, budget, copy_ms
         self._current: int | None = None
+        self._fading: tuple[int, int] | None = None  # from which setting, and for how many frames so far
         self._wished_for = 0
         # Logarithms of measured over predicted time of the last frames, by setting; one that has not run yet takes over
         # those of its method's others.
@@ -502,31 +513,50 @@ class Chooser:
             No setting is expected to keep the budget: by how much. Once, until it changes.
         """
         errors, times = self.curves.errors(feature), self._times(feature)
-        wished, reason = self._wish(feature, errors, times)
-        taken = wished
-        current = self._current
-        if current is not None and wished != current and self._keeps(current, feature, errors, times):
-            # Nothing is wrong with what runs: change for a gain that lasts, since a change can be seen.
-            if self.budget.max_ms is None:
-                gains = times[wished] < _CHEAPER * times[current]
-            else:
-                gains = errors[wished] > errors[current] + _BETTER_DB
-            self._wished_for = self._wished_for + 1 if gains else 0
-            if self._wished_for < _PATIENCE:
-                taken, reason = current, "kept from the frame before"
-        if taken == wished:
-            self._wished_for = 0
+        before = self._current
+        if self._fading is not None and before is not None:  # one change at a time
+            taken, reason = before, "kept from the frame before"
+        else:
+            taken, reason = self._next(feature, errors, times)
+        if before is not None and taken != before:
+            fits = self.budget.max_ms is None or times[taken] + times[before] <= self.budget.max_ms
+            self._fading = (before, 0) if fits else None
         self._current = taken
+        fades_from, share, cost = None, 1.0, float(times[taken])
+        if self._fading is not None:
+            old, done = self._fading
+            fades_from, share = self.curves.settings[old], (done + 1) / (_FADE + 1)
+            cost += float(times[old])
+            self._fading = (old, done + 1) if done + 1 < _FADE else None
         choice = Choice(
             self.curves.settings[taken],
-            float(times[taken]),
+            cost,
             float(errors[taken]),
             float(self.curves.uncertainty_db[taken]),
             self._meets(taken, errors, times),
             reason,
+            fades_from,
+            share,
         )
         self._warn(taken, choice)
         return choice
+
+    def _next(self, feature: Vector, errors: Vector, times: Vector) -> tuple[int, str]:
+        """The setting to take: another one when the one that runs fails, or when a gain has lasted."""
+        wished, reason = self._wish(feature, errors, times)
+        current = self._current
+        if current is None or wished == current or not self._keeps(current, feature, errors, times):
+            self._wished_for = 0
+            return wished, reason
+        if self.budget.max_ms is None:
+            gains = times[wished] < _CHEAPER * times[current]
+        else:
+            gains = errors[wished] > errors[current] + _BETTER_DB
+        self._wished_for = self._wished_for + 1 if gains else 0
+        if self._wished_for < _PATIENCE:
+            return current, "kept from the frame before"
+        self._wished_for = 0
+        return wished, reason
 
     def observe(self, choice: Choice, feature: Vector, ms: float) -> None:
         """Learn from what a frame took, programs and buffers left out; its choice is one of :meth:`choose`."""

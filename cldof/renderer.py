@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .auto import Auto, Budget, Choice, Chooser, features, load_curves
+from .auto import Auto, Budget, Choice, Chooser, Setting, features, load_curves
 from .camera import Camera
 from .errors import CldofError, DeviceError, InputError
 from .frame import LayeredFrame
@@ -146,18 +146,19 @@ class _Automatic:
         self._lock = threading.Lock()  # results may be asked for by other threads than frames
         self.under_way = 0
 
-    def choose(self, stats: SceneStats, lens: Lens, camera: Camera) -> tuple[Method, Choice, NDArray[np.float64]]:
+    def choose(self, stats: SceneStats, lens: Lens, camera: Camera) -> tuple[Choice, NDArray[np.float64]]:
         with self._lock:
             if self._chooser is None:
                 info = self._device.info
                 curves = load_curves(info.name, info.driver_version)
                 self._chooser = Chooser(curves, self._budget, copy_baseline(self._device, runs=12).min_ms)
             feature = features(stats, lens, camera)
-            choice = self._chooser.choose(feature)
-            setting = choice.setting
-            if str(setting) not in self._methods:
-                self._methods[str(setting)] = make_method(setting.method, **setting.options)
-            return self._methods[str(setting)], choice, feature
+            return self._chooser.choose(feature), feature
+
+    def method(self, setting: Setting) -> Method:
+        if str(setting) not in self._methods:
+            self._methods[str(setting)] = make_method(setting.method, **setting.options)
+        return self._methods[str(setting)]
 
     def learn(self, choice: Choice, feature: NDArray[np.float64], ms: float) -> None:
         with self._lock:
@@ -177,16 +178,23 @@ class PendingResult:
         started: float,
         profile: bool,
         report: Callable[[], None],
-        chosen: _Chosen | None = None,
     ) -> None:
         self._submission, self._event, self._image, self._plan = submission, event, image, plan
         self._report = report  # tells the renderer that the frame failed
-        self._started, self._profile, self._chosen = started, profile, chosen
+        self._started, self._profile = started, profile
+        self._chosen: _Chosen | None = None
+        self._faded: PendingResult | None = None
         self._result: Result | None = None
+
+    def chosen(self, chosen: _Chosen, faded: PendingResult | None) -> None:
+        """Of ``method="auto"``: the choice, and the same frame by the setting that it fades from."""
+        self._chosen, self._faded = chosen, faded
 
     def done(self) -> bool:
         """Whether :meth:`result` would return at once."""
-        return self._result is not None or int(self._event.command_execution_status) <= 0
+        if self._result is not None:
+            return True
+        return int(self._event.command_execution_status) <= 0 and (self._faded is None or self._faded.done())
 
     def result(self) -> Result:
         """Wait for the image.
@@ -201,16 +209,20 @@ class PendingResult:
                 with driver_errors("a frame did not arrive"):
                     self._submission.wait()
                     self._event.wait()
+                before = None if self._faded is None else self._faded.result()
             except DeviceError:
                 self._report()
                 if self._chosen is not None:
                     self._chosen.failed()
                 raise
-            wall_ms = (time.perf_counter() - self._started) * 1e3
             timings = pass_timings(self._submission) if self._profile else []
-            choice = None
+            choice = None if self._chosen is None else self._chosen.choice
+            if before is not None and choice is not None:
+                self._image *= np.float32(choice.share)
+                self._image += np.float32(1.0 - choice.share) * before.image
+                timings = [*before.timings, *timings]
+            wall_ms = (time.perf_counter() - self._started) * 1e3
             if self._chosen is not None:
-                choice = self._chosen.choice
                 self._chosen.took(wall_ms)
             self._result = Result(self._image, timings, wall_ms, self._plan, choice)
         return self._result
@@ -343,26 +355,36 @@ class Renderer:
         image = _output_array(out, (*self._image_size(shape), 4))
         with self._turn():
             held = self._upload(frame, shape)
-            method, choice, feature, is_alone = self.method, None, None, False
-            if self._automatic is not None and held.stats is not None:
-                is_alone = self._automatic.under_way == 0
-                method, choice, feature = self._automatic.choose(held.stats.wait(), lens, frame.camera)
-            assert not isinstance(method, Auto)
-            plan = self._plan(held, lens, method)
-            ring, is_new = self._ring(shape, plan, method)
-            inputs, waits = self._inputs(held, ring.program, method)
-            submission = ring.submit(inputs, plan.params, waits)
-            held.last_use = submission.event
-            output = "image" if self._supersample == 1 else "resolved"
-            download = self.device.pool.download(submission.batch.output(output), image, [submission.event])
-            submission.batch.hold(download)
-            chosen = None
-            if self._automatic is not None and choice is not None and feature is not None:
-                # The first frame of a kind builds what it needs; those that overlap with others wait for them.
-                chosen = _Chosen(self._automatic, choice, feature, is_alone and not is_new)
-        return PendingResult(
-            submission, download, image, plan, started, self.device.is_profiling, self._note_failure, chosen
-        )
+            if self._automatic is None:
+                assert not isinstance(self.method, Auto)
+                return self._start(held, lens, self.method, image, started)[0]
+            assert held.stats is not None
+            is_alone = self._automatic.under_way == 0
+            choice, feature = self._automatic.choose(held.stats.wait(), lens, frame.camera)
+            faded = None
+            if choice.fades_from is not None:
+                before = self._automatic.method(choice.fades_from)
+                faded, _ = self._start(held, lens, before, np.empty_like(image), started)
+            pending, is_new = self._start(held, lens, self._automatic.method(choice.setting), image, started)
+            # The first frame of a kind builds what it needs; those that overlap with others wait for them.
+            counts = is_alone and not is_new and faded is None
+            pending.chosen(_Chosen(self._automatic, choice, feature, counts), faded)
+            return pending
+
+    def _start(
+        self, held: _DeviceFrame, lens: Lens, method: Method, image: NDArray[np.float32], started: float
+    ) -> tuple[PendingResult, bool]:
+        """Enqueue a frame, and tell whether what it needs was made just now."""
+        plan = self._plan(held, lens, method)
+        ring, is_new = self._ring(held.shape, plan, method)
+        inputs, waits = self._inputs(held, ring.program, method)
+        submission = ring.submit(inputs, plan.params, waits)
+        held.last_use = submission.event
+        output = "image" if self._supersample == 1 else "resolved"
+        download = self.device.pool.download(submission.batch.output(output), image, [submission.event])
+        submission.batch.hold(download)
+        is_profiling = self.device.is_profiling
+        return PendingResult(submission, download, image, plan, started, is_profiling, self._note_failure), is_new
 
     def stats(self, frame: LayeredFrame) -> SceneStats:
         """What the planner knows of a frame; uploads it, if need be, and waits for the answer.

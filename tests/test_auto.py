@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -224,6 +225,30 @@ def test_a_budget_that_is_missed_changes_the_setting_at_once() -> None:
     assert chooser.choose(feature(6.0)).setting == SETTINGS[1]
 
 
+def test_an_image_passes_from_setting_to_setting() -> None:
+    given = curves([35, 45, 20, 20], [1, 4, 9, 9], slope=1.0, kept=0.0)
+    chooser = Chooser(given, Budget.of("30dB"), 1.0)
+    assert chooser.choose(feature(0.0)).fades_from is None
+    choices = [chooser.choose(feature(6.0 if frame < 3 else 0.0)) for frame in range(9)]
+    # One change at a time, also when it is not wanted any longer.
+    assert all(choice.setting == SETTINGS[1] for choice in choices)
+    assert [choice.share for choice in choices] == pytest.approx([*(np.arange(1, 9) / 9), 1.0])
+    assert [choice.fades_from for choice in choices] == [SETTINGS[0]] * 8 + [None]
+    assert [choice.predicted_ms for choice in choices] == pytest.approx([5.0] * 8 + [4.0])
+
+
+def test_a_time_is_kept_while_settings_change() -> None:
+    given = curves([35, 45, 40, 20], [1, 4, 2, 9])
+    for limit, fades in ((7.0, True), (5.5, True), (4.9, False)):
+        chooser = Chooser(given, Budget.of(max_ms=limit), 1.0)
+        chooser.choose(feature())
+        chooser._current, chooser._ratios[1] = 0, deque([0.0])  # as if the quickest had run, and all is known
+        choices = [chooser.choose(feature()) for _ in range(12)]
+        assert choices[10].setting == SETTINGS[0] and choices[11].setting == SETTINGS[1]
+        assert (choices[11].fades_from == SETTINGS[0]) is fades
+        assert choices[11].predicted_ms == pytest.approx(5.0 if fades else 4.0)
+
+
 def test_times_are_corrected_by_what_frames_took() -> None:
     given = curves([25, 40, 33, 45], [1, 4, 2, 9])
     chooser = Chooser(given, Budget.of(max_ms=20), 1.0)
@@ -365,6 +390,24 @@ def test_auto_overlaps_frames_and_counts_only_those_alone(device_info: DeviceInf
         assert renderer._automatic._chooser is not None and not renderer._automatic._chooser._ratios
         renderer.render(frame, Lens(0.02, 2.0))
         assert renderer._automatic._chooser._ratios
+
+
+def test_a_change_of_setting_is_a_blend_of_both(device_info: DeviceInfo, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, lens = noise_frame(48, 48, seed=6), Lens(0.03, 2.0, aperture="gaussian")
+    given = curves([35, 45, 20, 20], [1, 4, 9, 9], kept=0.0)
+    monkeypatch.setattr("cldof.renderer.load_curves", lambda device, driver: given)
+    amounts = iter([0.0, *[6.0] * 20])
+    monkeypatch.setattr("cldof.auto.Curves.errors", lambda self, value: self.error_db[0] - next(amounts))
+    with Renderer("auto", device=device_info.index, max_error="30dB") as renderer:
+        results = [renderer.render(frame, lens) for _ in range(10)]
+    ends = []
+    for setting in SETTINGS[:2]:
+        with Renderer(setting.method, device=device_info.index, **setting.options) as renderer:
+            ends.append(renderer.render(frame, lens).image)
+    assert np.array_equal(results[0].image, ends[0]) and np.array_equal(results[-1].image, ends[1])
+    for step, result in enumerate(results[1:9]):
+        share = (step + 1) / 9
+        assert result.image == pytest.approx((1.0 - share) * ends[0] + share * ends[1], abs=1e-6)
 
 
 @pytest.mark.parametrize(
