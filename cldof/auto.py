@@ -317,6 +317,8 @@ class Curves:
         :data:`TARGETS`, the share in which each did.
     uncertainty_db : ndarray, (S,)
         RMS error of predictions for scenes that they were not made from.
+    time_margin : ndarray, (S,)
+        Logarithm of the factor over predictions that 95 % of times stay below, for frames that they were not made from.
     source : mapping
         Device, driver, version and when: for people, and to know which curves are whose.
     """
@@ -328,6 +330,7 @@ class Curves:
     high: Vector
     kept: Mapping[str, Vector]
     uncertainty_db: Vector
+    time_margin: Vector
     source: Mapping[str, Any]
 
     def errors(self, feature: Vector) -> Vector:
@@ -362,6 +365,7 @@ class Curves:
             "high": _rounded(self.high),
             "kept": {shape: _rounded(share) for shape, share in self.kept.items()},
             "uncertainty_db": _rounded(self.uncertainty_db),
+            "time_margin": _rounded(self.time_margin),
             "source": dict(self.source),
         }
         return json.dumps(data, indent=1, allow_nan=False) + "\n"
@@ -389,6 +393,7 @@ class Curves:
                 _array(data["high"], shape[:1]),
                 {name: _array(data["kept"][name], (len(TARGETS), shape[1])) for name in ("gaussian", "disc")},
                 _array(data["uncertainty_db"], shape[1:]),
+                _array(data["time_margin"], shape[1:]),
                 dict(data["source"]),
             )
         except InputError:
@@ -459,13 +464,14 @@ def curves_name(device: str, driver: str) -> str:
 
 
 # Of the settings that kept an error in most tuning cases, those are trusted with it that kept it as often as the best
-# buy, where one case more in a hundred is worth 1.3 times the time; unless the prediction is this much too low.
-_WORTH, _LEAST_TRUSTED, _DISTRUST_DB = 100.0 * math.log(1.3), 0.9, 0.0
+# buy, where one case more in a hundred is worth 1.4 times the time; unless the prediction is this much too low.
+_WORTH, _LEAST_TRUSTED, _DISTRUST_DB = 100.0 * math.log(1.4), 0.92, 0.0
 # Others are taken when they are expected to do better by so many of their uncertainties: a cheaper one in place of a
 # trusted one, and any where none is trusted.
 _DOWNGRADE, _MARGIN = 1.5, 1.0
-# Share of a time that is left unused, for what the model does not know: before a method's first frame and after.
-_HEADROOM, _LATER_HEADROOM = 0.25, 0.08
+# What a time has to hold: so much of the margin for a setting that has not run, less of it where another of its method
+# has, and this factor once it has run itself.
+_UNKNOWN, _RELATED, _KNOWN = 1.0, 0.5, 1.08
 # Frames of a setting whose median time corrects the model: one that was held up does not count.
 _REMEMBERED = 5
 # Frames in a row for which another setting has to be better by this much before it is taken.
@@ -579,7 +585,7 @@ class Chooser:
 
     def _best_for_time(self, errors: Vector, times: Vector) -> tuple[int, str]:
         assert self.budget.max_ms is not None
-        fits = np.flatnonzero(times <= self.budget.max_ms * (1.0 - self._headroom()))
+        fits = np.flatnonzero(times * self._headroom() <= self.budget.max_ms)
         if not fits.size:
             return int(times.argmin()), "the quickest there is"
         return _nearly_best(fits, errors, times), f"the least error of {fits.size} settings that fit"
@@ -601,8 +607,13 @@ class Chooser:
         best_buy = kept[np.argmin(np.log(times) - _WORTH * kept)]
         return np.asarray((kept >= max(best_buy, _LEAST_TRUSTED)) & (errors >= target - distrust_db))
 
-    def _headroom(self) -> float:
-        return _LATER_HEADROOM if self._ratios else _HEADROOM
+    def _headroom(self) -> Vector:
+        """Factors on expected times, for what the model does not know, (S,)."""
+        methods = {self.curves.settings[index].method for index in self._ratios}
+        parts = [_RELATED if setting.method in methods else _UNKNOWN for setting in self.curves.settings]
+        factors: Vector = np.maximum(_KNOWN, np.exp(np.array(parts) * self.curves.time_margin))
+        factors[list(self._ratios)] = _KNOWN
+        return factors
 
     def _keeps(self, index: int, feature: Vector, errors: Vector, times: Vector) -> bool:
         """Whether a setting that runs may go on: the budget with less margin than a new one needs."""

@@ -73,9 +73,11 @@ less than half of the time."""
 _BEST_DB = 50.0
 # Strength of the ridge: with 14 scenes, models that fit them more closely say less about any other scene.
 _RIDGE = 30.0
-_TIME_RIDGE = 0.3
+_TIME_RIDGE, _TIME_PARTS = 3.0, 14
 # Features that times depend on; the others describe what is seen, not what is computed.
-_TIME_FEATURES = ("one", "pixels", "peels", "blur", "blur_rms", "least_blur", "sharp", "near_coc", "far_coc", "glass")
+_TIME_FEATURES = (
+    "one", "pixels", "peels", "blur", "blur_rms", "sharp", "near_coc", "far_coc", "light_tiles", "void"
+)  # fmt: skip
 
 # Image sizes and lenses per scene: errors at small sizes, where references are quick, times also at a large one.
 _ERROR_SIZES, _LENSES = (128, 256), 8
@@ -179,11 +181,13 @@ def reference_for(
     camera: Camera,
     lens: Lens,
     seed: int = 0,
-    noise_db: float = _NOISE_DB,
-    most: int = _MOST_VIEWS,
+    noise_db: float | None = None,
+    fewest: int | None = None,
+    most: int | None = None,
 ) -> NDArray[np.float32]:
     """An accumulated image whose own noise is below what is to be measured, as far as so many views can."""
-    views, limit = _FEWEST_VIEWS, math.pow(10.0, -noise_db / 20.0)
+    views, most = fewest or _FEWEST_VIEWS, most or _MOST_VIEWS
+    limit = math.pow(10.0, -(_NOISE_DB if noise_db is None else noise_db) / 20.0)
     while True:
         made = cache.accumulate(peeler, scene, camera, lens, views, seed=seed)
         noise = made.noise_rms or 0.0
@@ -257,14 +261,16 @@ def fit_curves(errors: Sequence[ErrorRow], times: Sequence[TimeRow], source: dic
         known = scenes != scene
         left_out[~known] = feature[~known] @ _ridge(feature[known], db[known], _RIDGE)
     is_disc = feature[:, FEATURES.index("is_disc")] > 0.5
+    log_time, margin = fit_times(times)
     return Curves(
         LADDER,
         _ridge(feature, db, _RIDGE),
-        fit_times(times),
+        log_time,
         feature.min(axis=0),
         feature.max(axis=0),
         {"disc": _kept(db[is_disc]), "gaussian": _kept(db[~is_disc])},
         np.sqrt(np.mean((db - left_out) ** 2, axis=0)),
+        margin,
         source,
     )
 
@@ -279,18 +285,27 @@ def _kept(db: Vector) -> Vector:
     return shares
 
 
-def fit_times(rows: Sequence[TimeRow]) -> Vector:
-    """Weights of the logarithm of times, zero for features that times do not depend on."""
+def fit_times(rows: Sequence[TimeRow]) -> tuple[Vector, Vector]:
+    """Weights of the logarithm of times, zero for features that times do not depend on, and :attr:`Curves.time_margin`.
+
+    The margin is over predictions for rows that were left out, a run of neighbours (which share a scene) at a time.
+    """
     used = [FEATURES.index(name) for name in _TIME_FEATURES]
-    feature = np.array([row.feature for row in rows])[:, used]
-    weights = np.zeros((len(FEATURES), len(rows[0].copies)))
-    weights[used] = _ridge(feature, np.log([row.copies for row in rows]), _TIME_RIDGE)
-    return weights
+    feature, log = np.array([row.feature for row in rows])[:, used], np.log([row.copies for row in rows])
+    weights = np.zeros((len(FEATURES), log.shape[1]))
+    weights[used] = _ridge(feature, log, _TIME_RIDGE)
+    error = log - feature @ weights[used]
+    part = np.arange(len(rows)) * _TIME_PARTS // len(rows)
+    for number in range(_TIME_PARTS) if len(rows) >= 2 * _TIME_PARTS else []:
+        out = part == number
+        error[out] = log[out] - feature[out] @ _ridge(feature[~out], log[~out], _TIME_RIDGE)
+    return weights, np.maximum(0.0, np.quantile(error, 0.95, axis=0))
 
 
 def with_times(curves: Curves, times: Sequence[TimeRow], source: dict[str, Any]) -> Curves:
     """The same errors with the times of another device."""
-    return replace(curves, log_time=fit_times(times), source=source)
+    log_time, margin = fit_times(times)
+    return replace(curves, log_time=log_time, time_margin=margin, source=source)
 
 
 def _ridge(feature: Vector, target: Vector, strength: float) -> Vector:

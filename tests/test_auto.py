@@ -54,7 +54,15 @@ def curves(
     low, high = np.full(len(FEATURES), -100.0), np.full(len(FEATURES), 100.0)
     shares = np.broadcast_to(kept, (len(TARGETS), len(SETTINGS))).astype(np.float64)
     return Curves(
-        SETTINGS, error_db, log_time, low, high, {"disc": shares, "gaussian": shares}, np.full(len(SETTINGS), 2.0), {}
+        SETTINGS,
+        error_db,
+        log_time,
+        low,
+        high,
+        {"disc": shares, "gaussian": shares},
+        np.full(len(SETTINGS), 2.0),
+        np.full(len(SETTINGS), math.log(1.25)),
+        {},
     )
 
 
@@ -155,10 +163,10 @@ def test_the_cheapest_trusted_setting_is_taken_for_an_error() -> None:
 
 
 def test_some_cases_more_are_not_worth_any_time() -> None:
-    # 4 % more are worth 1.3 ** 4 = 2.9 times the time.
+    # 4 % more are worth 1.4 ** 4 = 3.8 times the time.
     shares = [0.1, 0.1, 0.95, 0.99]
-    assert first(curves([31, 31, 31, 31], [1, 4, 2, 5.5], kept=shares), Budget.of("30dB")) == SETTINGS[3]
-    assert first(curves([31, 31, 31, 31], [1, 4, 2, 5.9], kept=shares), Budget.of("30dB")) == SETTINGS[2]
+    assert first(curves([31, 31, 31, 31], [1, 4, 2, 7.5], kept=shares), Budget.of("30dB")) == SETTINGS[3]
+    assert first(curves([31, 31, 31, 31], [1, 4, 2, 7.9], kept=shares), Budget.of("30dB")) == SETTINGS[2]
 
 
 def test_an_untrusted_setting_is_taken_when_it_is_expected_to_do_much_better() -> None:
@@ -273,7 +281,7 @@ def test_curves_survive_their_file() -> None:
     given = shipped_curves()
     again = Curves.from_json(given.to_json())
     assert again.settings == given.settings == LADDER
-    for name in ("error_db", "log_time", "low", "high", "uncertainty_db"):
+    for name in ("error_db", "log_time", "low", "high", "uncertainty_db", "time_margin"):
         assert np.array_equal(getattr(again, name), getattr(given, name))
     assert all(make_method(one.method, **one.options) for one in given.settings)
 
@@ -351,8 +359,9 @@ def test_a_fit_finds_what_measurements_follow() -> None:
 
 def test_times_follow_no_colours() -> None:
     _, times, _ = rows(4)
-    weights = fit_times(times)
-    for name in ("contrast", "lights", "luminance", "is_disc"):
+    weights, margin = fit_times(times)
+    assert ((margin > 0.0) & (margin < 0.1)).all()
+    for name in ("contrast", "texture", "luminance", "is_disc"):
         assert not weights[FEATURES.index(name)].any()
 
 
