@@ -126,3 +126,15 @@ def test_nothing_glossy_costs_nothing(device_info: DeviceInfo) -> None:
         small = Lens(0.05 / frame.lobe_turn_per_m, 1.5)
         assert renderer.render(frame, small).plan.summary["eyes"] == 0
         assert renderer.render(frame, LENS).plan.summary["eyes"] == 16
+
+
+def test_several_samples_a_pixel(device_info: DeviceInfo) -> None:
+    """Groups add up to all rays there too, and glossy frames change."""
+    dark = shaded_frame(70, 42, Lighting((), Ambient((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))), layers=3)
+    plain = render(device_info, dark, view_dependent=False, adaptive=False, supersample=2, centred=False)
+    assert plain.shape == (21, 35, 4)
+    shaded = render(device_info, dark, adaptive=False, supersample=2, centred=False)
+    np.testing.assert_allclose(shaded, plain, atol=2e-5)
+    lit = shaded_frame(70, 42, layers=3)
+    on = render(device_info, lit, supersample=2)
+    assert np.abs(on - render(device_info, lit, supersample=2, view_dependent=False)).max() > 0.05
