@@ -7,11 +7,12 @@ ARGS ?=
 
 export PYTHON
 
-.PHONY: help demo test bench lint clean
+.PHONY: help demo test stability bench lint clean
 
 help:
 	@echo "make demo   render a built-in scene to out/demo.png (and out/demo-pinhole.png beside it)"
 	@echo "make test   run all tests          (ARGS='-k lens' picks some)"
+	@echo "make stability  hard cases on every device, measured into docs/stability.md"
 	@echo "make bench  speed of each pass, then accuracy and time of every method, quickly (4 minutes)"
 	@echo "            ARGS=speed or ARGS=--quick: one of them; ARGS='--scenes row': any 'cldof bench' options"
 	@echo "make lint   ruff check, ruff format --check, mypy"
@@ -26,6 +27,12 @@ demo:
 test:
 	@scripts/setup.sh test
 	$(VENV)/python -m pytest $(ARGS)
+
+# What hard cases measure on every device of this machine, and the page of it.
+stability:
+	@scripts/setup.sh test
+	CLDOF_STABILITY=bench/results/stability.json $(VENV)/python -m pytest tests/hard_cases $(ARGS)
+	$(VENV)/python -m bench.stability
 
 bench:
 	@scripts/setup.sh bench

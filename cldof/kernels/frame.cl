@@ -5,7 +5,7 @@
 /* frame_inverse_depth: 1/z of every slot, in rows padded to a pitch.
  * source  DESIGN section 2: the CoC is linear in inverse depth, and 0 stands for infinity without being an inf
  * reads   depth  float[peels][height][width]      m, inf = sky or nothing there
- *         color  float[peels][height][width][4]   alpha tells sky from nothing; read where depth is inf only
+ *         color  float[peels][height][width][4]   tells what is there from what is not
  * writes  inv_depth  float[peels][height][pitch]  1/m, 0 = sky; `nothing` where nothing is there; EMPTY past the row
  * range   2-D, one item per row of a peel: (peels * height, 1), any local size */
 __kernel void frame_inverse_depth(__global float *restrict inv_depth, const __global float *restrict depth,
@@ -17,7 +17,10 @@ __kernel void frame_inverse_depth(__global float *restrict inv_depth, const __gl
     __global float *w = inv_depth + row * pitch;
     for (int x = 0; x < width; x++) {
         float inverse = 1.0f / z[x]; /* 0 for inf */
-        w[x] = inverse > 0.0f || rgba[4 * x + 3] > 0.0f ? inverse : nothing;
+        float there = inverse;
+        if (nothing < 0.0f) /* a slot without light or coverage hides nothing, whatever its depth */
+            there = rgba[4 * x] + rgba[4 * x + 1] + rgba[4 * x + 2] + rgba[4 * x + 3];
+        w[x] = there > 0.0f || rgba[4 * x + 3] > 0.0f ? inverse : nothing;
     }
     for (int x = width; x < pitch; x++) w[x] = EMPTY;
 }

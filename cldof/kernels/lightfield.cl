@@ -216,6 +216,9 @@ static inline int is_glass(const __global float *color, LightfieldSize size, int
     return a > 0.0f && a < OPAQUE_ALPHA;
 }
 
+/* Nothing at all: hides nothing, whatever its depth. */
+static inline int is_clear(const __global float *rgba) { return rgba[0] + rgba[1] + rgba[2] + rgba[3] <= 0.0f; }
+
 /* Sixteen inverse depths of a row from x on (a multiple of 16), and those one pixel to the left and right. */
 static inline float16 depths_at(const __global float *inv_depth, LightfieldSize size, int m, int x, int y)
 {
@@ -385,6 +388,9 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
             const int x = x0 + i;
             const float depth = ((const float *)&w)[i];
             if (depth < 0.0f || !open[x / TILE]) continue;
+#if LIGHTFIELD_VOID
+            if (depth > 0.0f && is_clear(color + ((size_t)line * size.width + x) * 4)) continue;
+#endif
             /* The void behind a surface is the same for every peel. */
             if (m > 0 && depth == 0.0f && inv_depth[row - peel + x] == 0.0f) continue;
             const float coc = ((const float *)&c)[i];

@@ -123,3 +123,23 @@ def test_a_checkered_stencil(method: Subject) -> None:
         image = method.render(frame, Lens(12.0 / CAMERA.focal_px, 2.0))
         keep_promises(method, case, frame, image)
         method.check(case, "light above alpha", max(0.0, (image[..., :3] - image[..., 3:]).max()), 1e-4)
+
+
+@pytest.mark.parametrize("opaque", [True, False], ids=["opaque", "void"])
+def test_clear_slots_hide_nothing(method: Subject, opaque: bool) -> None:
+    """Found by hypothesis: slots without light or coverage at finite depths, in front of a wall, change nothing."""
+    case = "clear slots at finite depths"
+    wall = textured(H, W)
+    if not opaque:
+        wall[:, 40:] = 0.0
+    far = np.where(wall[..., 3] > 0, np.float32(4.0), np.inf)
+    y, x = np.mgrid[:H, :W]
+    near = np.where((x // 3 + y // 5) % 2, np.float32(0.5), np.float32(1.7))
+    lens = Lens(9.0 / CAMERA.focal_px, 2.0)
+    alone = LayeredFrame(wall, far, CAMERA)
+    behind = LayeredFrame(np.stack([np.zeros_like(wall), wall]), np.stack([near, far]), CAMERA)
+    image = method.render(behind, lens)
+    keep_promises(method, case, behind, image)
+    # The range of depths, and with it the layers, takes in the clear slots.
+    bound = {"pyramid": 0.05, "layered": 0.05, "multiview": 0.3}.get(method.method, 1e-5)
+    method.check(case, "changes the wall behind by", np.abs(image - method.render(alone, lens)).max(), bound)
