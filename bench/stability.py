@@ -29,13 +29,13 @@ INTRODUCTION = """\
 # Numerical stability
 
 Made by `python -m bench.stability` from `bench/results/stability.json`; `make stability` measures again. Each row is
-an invariant of a hard case (`tests/hard_cases/`, one file per family) and the **largest value seen** for each method and
-driver, over all parameters of the case: sizes, blurs, lenses. A test fails where a value exceeds its bound. 0 means that
-nothing was off by a single bit. Where bounds differ from method to method, a wide one is a known limit of the
-method, explained where the test sets it and on the method's page.
+an invariant of a hard case (`tests/hard_cases/`, one file per family) and the **largest value seen** for each method
+and driver, over all parameters of the case: sizes, blurs, lenses. A test fails where a value exceeds its bound. 0
+means that nothing was off by a single bit. Where bounds differ from method to method, a wide one is a known limit of
+the method, explained where the test sets it and on the method's page.
 
-Variants: *iir* recursive filters throughout, *single* layers blurred one by one, *paper* as published, *atomic* views by
-atomic minima, *peels* rays through the peels themselves. They run on fast devices only.
+Variants: *iir* recursive filters throughout, *single* layers blurred one by one, *paper* as published, *atomic* views
+by atomic minima, *peels* rays through the peels themselves. They run on fast devices only.
 """
 
 
