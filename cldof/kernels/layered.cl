@@ -231,6 +231,12 @@ static inline void layered_block(float16 quad[4], const __global float *color, c
         const __global float *inv = inv_depth + row * size.pitch + x;
         float16 w = load_quad(inv);
         float16 before = m > 0 ? load_quad(inv - (size_t)size.height * size.pitch) : w;
+        /* Slots between that hold nothing do not count. */
+        for (int p = 2; p <= m; p++) {
+            const int16 is_past_nothing = (before < 0.0f) & (w >= 0.0f);
+            if (sum16(is_past_nothing ? (float16)(1.0f) : (float16)(0.0f)) == 0.0f) break;
+            before = is_past_nothing ? load_quad(inv - (size_t)p * size.height * size.pitch) : before;
+        }
         float16 weight = layered_weight(inv_depth, inv, w, before, layer, m, size, x, y);
         if (sum16(weight) <= 0.0f) continue;
         const __global float *rgba = color + (row * size.width + x) * 4;
