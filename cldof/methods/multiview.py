@@ -11,7 +11,8 @@ Where this differs from the paper, docs/methods/multiview.md has the measurement
   search by false position. All pixels of a run then move alike, and look-ups are contiguous.
 - Layers overlap as far as the surface slopes from pixel to pixel, not by a fixed 10 %.
 - Cones see means over windows of exactly their width, not mip levels.
-- The number of rays follows the blur of what a cell of 16 x 16 pixels can see.
+- The number of rays follows the blur of what a cell of 16 x 16 pixels can see, and rises where light is bright.
+- Frames may have several samples a pixel, which layers take in; around the focus they are thinner then.
 - Glossy surfaces are shaded from points all over the lens before cones take their means, not at the hit after means of
   normals and exponents were taken.
 """

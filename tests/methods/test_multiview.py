@@ -268,6 +268,38 @@ def test_rays_hit_what_dense_marching_hits(device: Device) -> None:
     assert np.mean(explained) >= 0.999
 
 
+@pytest.mark.parametrize("layers", [12, 32])
+def test_thin_layers_hit_as_often_as_false_position(device: Device, layers: int) -> None:
+    """Looking once into each of many thin layers finds at least as many of the hits as the paper's search in them."""
+    frame = hills()
+    lens = Lens(12.0 / frame.camera.focal_px, 1.9)
+    plan = Multiview(layers=layers).plan(frame, lens).structure
+    inverse = np.where(frame.color[..., 3] > 0, 1.0 / frame.depth.astype(np.float64), -1.0)
+    columns = oracle.slots(inverse, *lens.coc_coefficients(frame.camera))
+    reach = math.ceil(np.abs(plan.coc).max()) + 1
+    inner = (slice(reach, -reach), slice(reach, -reach))
+    shares = []
+    for point in lens.aperture.samples(6, seed=2):
+        image = render(device, frame, lens, one_ray=point, cone=False, layers=layers)
+        peel, row, column = np.unravel_index(image[..., 0].astype(int), frame.depth.shape)
+        once = oracle.Hits(peel, row, column, columns.near[peel, row, column])
+        exact = oracle.march(columns, point, 1.0 / 16.0)
+        searched = oracle.false_position(columns, plan.limits, point)
+        shares.append(
+            [
+                (
+                    (abs(found.row - exact.row) <= 1)
+                    & (abs(found.column - exact.column) <= 1)
+                    & (abs(found.coc - exact.coc) <= 1.0)
+                )[inner].mean()
+                for found in (once, searched)
+            ]
+        )
+    thin, search = np.mean(shares, axis=0)
+    assert thin >= 0.99, search
+    assert thin >= search - 0.002
+
+
 def test_aperture_zero_is_the_pinhole_image(device: Device) -> None:
     for guard in (0, 3):
         frame = noise_frame(61, 47, guard_px=guard)
@@ -305,19 +337,22 @@ def test_the_plane_in_focus_stays_between_blurred_things(device: Device) -> None
 
 
 @pytest.mark.parametrize("degrees", [0.0, 45.0, 80.0])
-def test_a_slope_lets_nothing_through(device: Device, degrees: float) -> None:
+@pytest.mark.parametrize("samples", [1, 3])
+def test_a_slope_lets_nothing_through(device: Device, degrees: float, samples: int) -> None:
     """White through focus before a black sky: where a layer ends, the next one must take over without a gap."""
-    camera = Camera(128, 96, 40.0)
-    y = (np.arange(96) + 0.5 - 48) / camera.focal_px
+    height, width = 96 * samples, 128 * samples
+    camera = Camera(width, height, 40.0)
+    y = (np.arange(height) + 0.5 - height / 2) / camera.focal_px
     inverse = np.clip((1.0 - math.tan(math.radians(degrees)) * y) / 2.0, 0.02, 4.0)
-    depth = np.full((2, 96, 128), np.inf, np.float32)
+    depth = np.full((2, height, width), np.inf, np.float32)
     depth[0] = 1.0 / inverse[:, None]
-    color = np.ones((2, 96, 128, 4), np.float32)
+    color = np.ones((2, height, width, 4), np.float32)
     color[1, ..., :3] = 0.0
     frame = LayeredFrame(color, depth, camera)
-    lens = Lens(6.0 / camera.focal_px, 2.0)
-    assert render(device, frame, lens, cone=False)[..., :3].min() > 0.999
-    assert render(device, frame, lens)[..., :3].min() > 0.98
+    lens = Lens(6.0 * samples / camera.focal_px, 2.0)
+    if samples == 1:
+        assert render(device, frame, lens, cone=False)[..., :3].min() > 0.999
+    assert render(device, frame, lens, supersample=samples)[..., :3].min() > 0.98
 
 
 @pytest.mark.parametrize("depth", [1.2, 1.99, 2.0, 9.0])

@@ -214,3 +214,46 @@ def nbuffer(cells: np.ndarray, levels: int) -> np.ndarray:
                 square = cells[j : j + (1 << level), i : i + (1 << level)]
                 out[level, j, i] = np.bitwise_or.reduce(square.ravel())
     return out
+
+
+def false_position(columns: Slots, bounds: np.ndarray, point: np.ndarray, steps: int = 3) -> Hits:
+    """The paper's own search (section 4.3): in every layer, steps of false position through its height field.
+
+    Layers hold the nearest slot between their bounds, with 10 % of overlap. Empty texels stand at the bound that puts
+    the first intersection inside the layer.
+    """
+    height, width = columns.near.shape[1:]
+    y, x = np.mgrid[:height, :width]
+    hits = Hits(*(np.full((height, width), -1) for _ in range(3)), np.full((height, width), np.nan))
+    for low, high in pairwise(bounds):
+        field, peel = np.full((height, width), np.inf), np.full((height, width), -1)
+        for m, near in enumerate(columns.near):
+            nearer = (near >= low) & (near < high + 0.1 * (high - low)) & (near < field)
+            field, peel = np.where(nearer, near, field), np.where(nearer, m, peel)
+
+        def fetch(c: np.ndarray, field: np.ndarray = field) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            column = np.clip(np.floor(x + point[0] * c + 0.5).astype(int), 0, width - 1)
+            row = np.clip(np.floor(y + point[1] * c + 0.5).astype(int), 0, height - 1)
+            return field[row, column], row, column
+
+        start, end = np.full((height, width), low), np.full((height, width), high)
+        first, last = fetch(start)[0], fetch(end)[0]
+        first, last = np.where(np.isfinite(first), first, high), np.where(np.isfinite(last), last, low)
+        found = [np.full((height, width), -1) for _ in range(3)]
+        for _ in range(steps):
+            slope = (end - start) - (last - first)
+            share = np.where(np.abs(slope) > 1e-9, (first - start) / np.where(np.abs(slope) > 1e-9, slope, 1.0), 0.5)
+            middle = start + np.clip(share, 0.0, 1.0) * (end - start)
+            value, row, column = fetch(middle)
+            there = np.isfinite(value)
+            for old, new in zip(found, (peel[row, column], row, column), strict=True):
+                np.copyto(old, new, where=there)
+            before = there & (value < middle)
+            first = np.where(there & ~before, value, first)
+            last, end = np.where(before, value, last), np.where(before, middle, end)
+            start = np.where(before, start, middle)
+        is_new = (found[0] >= 0) & (hits.peel < 0)
+        coc = columns.near[np.maximum(found[0], 0), found[1], found[2]]
+        for old, new in zip(hits, (*found, coc), strict=True):
+            np.copyto(old, new, where=is_new)
+    return hits
