@@ -7,12 +7,15 @@ ARGS ?=
 
 export PYTHON
 
-.PHONY: help demo test stability bench lint clean
+.PHONY: help demo test test-devices test-oclgrind stability mutants bench lint clean
 
 help:
 	@echo "make demo   render a built-in scene to out/demo.png (and out/demo-pinhole.png beside it)"
 	@echo "make test   run all tests          (ARGS='-k lens' picks some)"
 	@echo "make stability  hard cases on every device, measured into docs/stability.md"
+	@echo "make test-devices   the kernel and method tests on every OpenCL driver that can be installed, and how they agree"
+	@echo "make test-oclgrind  every kernel under a simulator that checks each access to memory (2 minutes)"
+	@echo "make mutants        faults put into the kernels: how many the tests notice (an hour)"
 	@echo "make bench  speed of each pass, then accuracy and time of every method, quickly (4 minutes)"
 	@echo "            ARGS=speed or ARGS=--quick: one of them; ARGS='--scenes row': any 'cldof bench' options"
 	@echo "make lint   ruff check, ruff format --check, mypy"
@@ -33,6 +36,20 @@ stability:
 	@scripts/setup.sh test
 	CLDOF_STABILITY=bench/results/stability.json $(VENV)/python -m pytest tests/hard_cases $(ARGS)
 	$(VENV)/python -m bench.stability
+
+test-devices:
+	@scripts/setup.sh test
+	@scripts/devices.sh $(ARGS)
+
+test-oclgrind:
+	@scripts/setup.sh test
+	@scripts/setup.sh oclgrind
+	@if command -v oclgrind >/dev/null; then $(VENV)/python -m tests.tools.checked $(ARGS); \
+	else echo "SKIPPED: oclgrind is not here and cannot be installed; no kernel was checked" >&2; fi
+
+mutants:
+	@scripts/setup.sh test
+	$(VENV)/python -m tests.tools.mutate $(ARGS)
 
 bench:
 	@scripts/setup.sh bench

@@ -11,6 +11,8 @@ import atexit
 import os
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,7 +23,7 @@ import pytest
 from cldof.errors import DeviceError
 from cldof.host import opencl as cl
 from cldof.host.buffers import BufferPool
-from cldof.host.device import Device, DeviceInfo, list_devices
+from cldof.host.device import Device, DeviceInfo, Traits, list_devices
 
 hypothesis.settings.register_profile("cldof", deadline=None, derandomize="CI" in os.environ)
 hypothesis.settings.load_profile("cldof")
@@ -68,8 +70,11 @@ os.environ["CLDOF_CACHE_DIR"] = str(Path(os.environ["POCL_CACHE_DIR"]) / "cldof"
 
 
 def _find_devices() -> tuple[list[DeviceInfo], str]:
+    """All devices, or with ``CLDOF_TEST_DEVICE`` those whose name or platform has it."""
+    part = os.environ.get("CLDOF_TEST_DEVICE", "").lower()
     try:
-        return list_devices(), "this machine has no OpenCL device"
+        found = [info for info in list_devices() if part in info.name.lower() or part in info.platform.lower()]
+        return found, f"this machine has no OpenCL device {part}".rstrip()
     except DeviceError as error:
         return [], str(error)
 
@@ -78,11 +83,37 @@ _DEVICES, _WHY_NONE = _find_devices()
 _PARAMS = [pytest.param(info, id=f"{info.index}-{info.name.split('-')[0].replace(' ', '_')}") for info in _DEVICES]
 
 
+def _make_small() -> None:
+    """With ``CLDOF_TEST_LIMITS=64,32768[,gpu]`` every device has such work-groups and local memory, and is no CPU."""
+    if not (limits := os.environ.get("CLDOF_TEST_LIMITS")):
+        return
+    group, local_bytes, *kind = limits.split(",")
+    real: Any = Device.traits.func  # type: ignore[attr-defined]
+
+    def small(device: Device) -> Traits:
+        group_size = min(int(group), (traits := real(device)).max_work_group_size)
+        return replace(
+            traits,
+            max_work_group_size=group_size,
+            preferred_group_limit=min(group_size, traits.preferred_group_limit),
+            local_mem_bytes=min(int(local_bytes), traits.local_mem_bytes),
+            is_cpu=traits.is_cpu and not kind,
+        )
+
+    replaced = cached_property(small)
+    replaced.__set_name__(Device, "traits")
+    Device.traits = replaced  # type: ignore[method-assign, assignment]
+
+
+_make_small()
+
+
 class CanaryPool(BufferPool):
     """A pool whose buffers have the size asked for to the byte, canaries on both sides, and NaN inside."""
 
     def __init__(self, context: Any, queue: Any, *, shares_memory: bool) -> None:
         super().__init__(context, queue, shares_memory=shares_memory)
+        self.fill = UNWRITTEN
         self._margin = max(queue.device.mem_base_addr_align // 8, 512)
         self._parents: dict[int, tuple[Any, Any, int]] = {}
 
@@ -91,7 +122,7 @@ class CanaryPool(BufferPool):
         if nbytes <= 0 or nbytes + 2 * self._margin > self._queue.device.max_mem_alloc_size:
             return super().acquire(nbytes)
         contents = np.full(nbytes + 2 * self._margin, CANARY, np.uint8)
-        contents[self._margin : -self._margin] = UNWRITTEN
+        contents[self._margin : -self._margin] = self.fill
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
         parent = cl.Buffer(self._context, flags, hostbuf=contents)
         buffer = parent.get_sub_region(self._margin, nbytes)

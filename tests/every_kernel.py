@@ -1,0 +1,153 @@
+"""Small frames that between them run every kernel in every form, for checks that look at memory and not at pictures.
+
+:mod:`tests.test_every_kernel` runs them between canaries, :mod:`tests.tools.checked` under a simulator that watches
+every access to memory.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import cldof.kernels
+from cldof import Camera, LayeredFrame, Lens, Renderer
+from cldof.host.device import Device
+from cldof.methods import gaussian
+from tests.frames import noise_frame
+from tests.kernels import test_blur as blur
+from tests.shaded import shaded_frame
+
+__all__ = ["CASES", "Case", "kernels_in_sources", "record_kernels"]
+
+WIDTH, HEIGHT = 48, 32
+
+
+@dataclass(frozen=True)
+class Case:
+    """One frame and how to render it."""
+
+    method: str
+    options: dict[str, Any] = field(default_factory=dict)
+    frame: str = "opaque"  # a name of FRAMES
+    coc_px: float = 5.0
+    renderer: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """For people and files."""
+        parts = {**self.options, **self.renderer}
+        words = [self.method, self.frame, f"{self.coc_px:g}px", *(f"{key}={value}" for key, value in parts.items())]
+        return " ".join(words).replace("/", "")
+
+    def run(self, device: Device) -> np.ndarray:
+        """Render it on a device of the caller's, which is left open."""
+        if self.method == "blur":
+            return _blurred(device)
+        renderer = Renderer(self.method, queue=device.queue, **self.renderer, **self.options)
+        renderer.device = device
+        frame = FRAMES[self.frame]()
+        return renderer.render(frame, Lens(self.coc_px / frame.camera.focal_px, 2.0)).image
+
+
+def _blurred(device: Device) -> np.ndarray:
+    """blur.cl by itself: no method calls it."""
+    image = np.random.default_rng(0).random((HEIGHT, WIDTH, 4), np.float32)
+    return np.stack([blur.fir(device, image, gaussian.fir_taps(2.0)), blur.iir(device, image, 7.0)])
+
+
+def _mostly_sharp() -> LayeredFrame:
+    """In focus but for a corner, so that the planner works in windows."""
+    depth = np.full((1, 96, 128), 2.0, np.float32)
+    depth[:, :20, :20] = 9.0
+    color = np.random.default_rng(1).random((1, 96, 128, 4)).astype(np.float32)
+    color[..., 3] = 1.0
+    return LayeredFrame(color, depth, Camera(128, 96, 40.0))
+
+
+FRAMES: dict[str, Callable[[], LayeredFrame]] = {
+    "opaque": lambda: noise_frame(WIDTH, HEIGHT, 3, guard_px=3),
+    "void": lambda: noise_frame(WIDTH - 1, HEIGHT - 1, 3, opaque=False),
+    "one": lambda: noise_frame(7, 5, 1),
+    "pixel": lambda: noise_frame(1, 1, 1),
+    "sharp": _mostly_sharp,
+    "shaded": lambda: shaded_frame(WIDTH, HEIGHT),
+}
+
+
+def _cases() -> Iterator[Case]:
+    yield Case("blur")
+    for method in ("gather", "layered", "pyramid", "multiview", "lightfield"):
+        for frame in FRAMES:
+            yield Case(method, frame=frame)
+        yield Case(method, frame="void", renderer={"planned": False})
+    yield Case("gather", frame="sharp", coc_px=20.0, renderer={"supersample": 2})
+    for options in ({"cascade": False}, {"matting": "paper"}):
+        for frame in ("opaque", "void"):
+            yield Case("layered", options, frame)
+    yield Case("layered", coc_px=40.0)  # the recursive engine
+    yield Case("layered", {"cascade": False}, coc_px=40.0)
+    for options in (
+        {"matting": "paper", "radius": "paper"},
+        {"hidden": "interpolated"},
+        {"normalise": False},
+    ):
+        for frame in ("opaque", "void"):
+            yield Case("pyramid", options, frame)
+    yield Case("pyramid", coc_px=40.0)
+    for options in (
+        {"cone": False, "rays": 8},
+        {"traversal": "peels", "cone": False, "rays": 8},
+        {"jitter": True, "rays": 8},
+        {"jitter": True, "traversal": "peels", "cone": False, "rays": 8},
+        {"adaptive": False, "cull": False, "rays": 8},
+    ):
+        for frame in ("opaque", "void"):
+            yield Case("multiview", options, frame)
+    for options in (
+        {"warp": "views"},
+        {"warp": "atomic"},
+        {"warp": "packed"},
+        {"support": "none", "warp": "atomic"},
+        {"support": "2x2"},
+        {"support": "3x3"},
+        {"lookup": "winner"},
+        {"lookup": "jitter"},
+        {"memory_mb": 0.05},
+        {"cull": False, "pattern": "halton"},
+    ):
+        for frame in ("opaque", "void"):
+            yield Case("lightfield", {"views": 6, **options}, frame)
+    yield Case("lightfield", {"views": 5}, coc_px=40.0)  # mip levels
+    yield Case("lightfield", {"views": 5, "lookup": "winner"}, "void", coc_px=40.0)
+
+
+CASES: list[Case] = list(_cases())
+
+
+@contextmanager
+def record_kernels(device: Device) -> Iterator[set[str]]:
+    """Names of the kernels that are made inside the block."""
+    names: set[str] = set()
+    make = device.programs.kernel
+
+    def recorded(stem: str, name: str, *rest: Any) -> Any:
+        names.add(name)
+        return make(stem, name, *rest)
+
+    device.programs.kernel = recorded  # type: ignore[method-assign]
+    try:
+        yield names
+    finally:
+        del device.programs.kernel  # type: ignore[attr-defined]
+
+
+def kernels_in_sources() -> set[str]:
+    """Every kernel of the library."""
+    folder = Path(next(iter(cldof.kernels.__path__)))
+    return {name for file in folder.glob("*.cl") for name in re.findall(r"__kernel\s+void\s+(\w+)", file.read_text())}

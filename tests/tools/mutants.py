@@ -1,0 +1,201 @@
+# ruff: noqa: E501 - lines of kernels
+"""Small faults for the kernels, by hand: what is put in place of what, and which tests should notice.
+
+An anchor has to occur in its file exactly once. When a kernel changes, :mod:`tests.tools.mutate` refuses to run until the
+anchor follows: a list that silently shrinks proves nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["MUTANTS", "SUITES", "WIDE", "Mutant"]
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One fault.
+
+    Parameters
+    ----------
+    file : str
+        In ``cldof/kernels``.
+    old, new : str
+        Text that occurs once, and what replaces it.
+    kind : str
+        ``"sign"``, ``"clamp"``, ``"off by one"``, ``"swap"``, ``"compare"``, ``"index"``, ``"weight"`` or ``"drop"``.
+    """
+
+    file: str
+    old: str
+    new: str
+    kind: str
+
+    @property
+    def name(self) -> str:
+        """For people: file, kind and the text that is gone."""
+        old, new = (" ".join(text.split()) for text in (self.old, self.new))
+        return f"{self.file} ({self.kind}): {old} -> {new or 'nothing'}"
+
+
+# What of the suite is run first, by kernel file: the tests that know that file best, without slow ones.
+SUITES: dict[str, list[list[str]]] = {
+    "blur.cl": [["tests/kernels/test_blur.py", "-k", "not full_hd and not 200 and not 120"]],
+    "frame.cl": [["tests/kernels/test_frame.py", "tests/test_renderer.py", "-k", "inverse or supersampling"]],
+    "gather.cl": [["tests/kernels/test_gather.py", "tests/methods/test_gather.py"]],
+    "layered.cl": [["tests/methods/test_layered.py"]],
+    "lightfield.cl": [["tests/kernels/test_lightfield.py"], ["tests/methods/test_lightfield.py"]],
+    "multiview.cl": [
+        ["tests/kernels/test_multiview.py"],
+        ["tests/methods/test_multiview.py", "-k", "not dense_marching and not dense_sampling"],
+    ],
+    "pyramid.cl": [["tests/kernels/test_pyramid.py"], ["tests/methods/test_pyramid.py", "-k", "not scenes"]],
+    "common.clh": [
+        ["tests/kernels/test_gather.py", "tests/methods/test_layered.py"],
+        ["tests/kernels/test_pyramid.py"],
+    ],
+    "fir.clh": [["tests/kernels/test_blur.py", "-k", "fir"], ["tests/methods/test_layered.py"]],
+}
+
+# What is run for those that survive.
+WIDE: list[list[str]] = [
+    ["tests/methods/test_promises.py", "tests/test_renderer.py"],
+    ["tests/methods", "-k", "reference or dense_marching"],
+]
+
+
+def _rows(file: str, *rows: tuple[str, str, str]) -> list[Mutant]:
+    return [Mutant(file, old, new, kind) for kind, old, new in rows]
+
+
+MUTANTS: list[Mutant] = [
+    *_rows(
+        "common.clh",
+        ("drop", "float4 c = n > 2 ? load_pixel(p + 8) : (float4)(0.0f);", "float4 c = (float4)(0.0f);"),
+        ("sign", "front + (1.0f - front.s33337777bbbbffff) * back", "front + (1.0f + front.s33337777bbbbffff) * back"),
+        ("swap", "(v.xxxx, v.yyyy, v.zzzz, v.wwww)", "(v.xxxx, v.zzzz, v.yyyy, v.wwww)"),
+        ("clamp", "return v > 1.0f ? (float16)(1.0f) : v;", "return v;"),
+        ("clamp", "    return i > last ? last : i;", "    return i > last ? last - (last > 0) : i;"),
+    ),
+    *_rows(
+        "fir.clh",
+        ("off by one", "acc[i] += taps[t - i] * v;", "acc[i] += taps[t - i + 1] * v;"),
+        ("clamp", "int y = clamp_index(y0 + t, height - 1);", "int y = clamp_index(y0 + t, height - 2);"),
+        ("swap", "int from = (x < 0 ? 0 : width - 1) - first;", "int from = (x < 0 ? width - 1 : 0) - first;"),
+        ("off by one", "float a = taps[t], b = taps[t - 4];", "float a = taps[t], b = taps[t - 3];"),
+        ("off by one", "for (int t = -radius; t <= radius + 4; t++)", "for (int t = -radius; t < radius + 4; t++)"),
+    ),
+    *_rows(
+        "blur.cl",
+        ("off by one", "const __global float *centre = taps + FIR_PAD + radius;",
+         "const __global float *centre = taps + FIR_PAD + radius - 1;"),
+        ("sign", "(x - k[i].pole_im * s->im[i])", "(x + k[i].pole_im * s->im[i])"),
+        ("sign", "y += k[i].gain_re * s->re[i] - k[i].gain_im * s->im[i];",
+         "y += k[i].gain_re * s->re[i] + k[i].gain_im * s->im[i];"),
+        ("drop", "iir_rest(&s, sections, load_quad(from + (height - 1) * stride));", ""),
+        ("index", "iir_rest(&s, sections, load_rows(from, width - 1));", "iir_rest(&s, sections, load_rows(from, 0));"),
+        ("off by one", "for (int y = height - 1; y >= 0; y--)", "for (int y = height - 1; y > 0; y--)"),
+    ),
+    *_rows(
+        "frame.cl",
+        ("compare", "inverse > 0.0f || rgba[4 * x + 3] > 0.0f", "inverse > 0.0f || rgba[4 * x + 3] >= 0.0f"),
+        ("drop", "for (int x = width; x < pitch; x++) w[x] = EMPTY;", ""),
+        ("weight", "1.0f / (float)(factor * factor)", "1.0f / (float)(factor)"),
+        ("off by one", "for (int i = 0; i < factor; i++) sum", "for (int i = 1; i < factor; i++) sum"),
+    ),
+    *_rows(
+        "gather.cl",
+        ("sign", "float coc = c1 * flat_inv[at] + c0;", "float coc = c1 * flat_inv[at] - c0;"),
+        ("compare", "weight = theirs > coc ||", "weight = theirs < coc ||"),
+        ("drop", "total > 1e-3f ? sum / total : own", "total > 1e-3f ? sum : own"),
+        ("off by one", "radius * samples[3 * k] + 0.5f)", "radius * samples[3 * k] + 1.5f)"),
+        ("clamp", "reach = reach < 0.0f ? 0.0f : reach;", ""),
+    ),
+    *_rows(
+        "layered.cl",
+        ("swap", "k > 0 ? matting->layer[k - 1] : (float4)(0.0f)", "matting->layer[k]"),
+        ("clamp", "to_a = a < 0.0f || to_a > silhouette ?", "to_a = a < 0.0f ?"),
+        ("off by one", "float16 left = x > 0 ? load_quad(inv - 1)", "float16 left = x > 0 ? load_quad(inv - 2)"),
+        ("compare", "return across > down ? across : down;", "return across < down ? across : down;"),
+        ("swap", "load_quad(top + x), load_quad(bottom + x)", "load_quad(top + x), load_quad(top + x)"),
+        ("weight", "return found * 0.125f;", "return found * 0.25f;"),
+        ("compare", "float16 at_once = falling >= 1.0f ?", "float16 at_once = falling > 0.0f ?"),
+        ("sign", "up = clamp01((rising - 1.0f) / part + 1.0f);", "up = clamp01((rising - 1.0f) / part - 1.0f);"),
+        ("weight", "float16 others = 1.0f - rest *", "float16 others = 1.0f + rest *"),
+        ("drop", "return w < 0.0f ? zero : up * down;", "return up * down;"),
+        ("swap", "c.s37bf = is_last ? (float4)(1.0f) : a;", "c.s37bf = is_last ? a : (float4)(1.0f);"),
+        ("sign", "float4 rest = 1.0f - (1.0f - t) * alpha;", "float4 rest = 1.0f - t * alpha;"),
+        ("swap", "store_quad_local(at, in_front ? over(filtered[i], layer)", "store_quad_local(at, !in_front ? over(filtered[i], layer)"),
+        ("compare", ">= 4.0f * FIR_ROWS;", ">= 2.0f * FIR_ROWS;"),
+        ("drop", "any |= reached[r * size.tiles_x + tx]", "any = reached[r * size.tiles_x + tx]"),
+        ("compare", "nearest = w > nearest ? w : nearest;", "nearest = w < nearest ? w : nearest;"),
+        ("index", "|= 1u << m;", "|= 2u << m;"),
+        ("drop", "float4 scale = coverage > LAYERED_MIN_COVERAGE ? 1.0f / coverage : (float4)(0.0f);",
+         "float4 scale = coverage > LAYERED_MIN_COVERAGE ? (float4)(1.0f) : (float4)(0.0f);"),
+        ("swap", "first ? acc[i] : over(load_quad(to), acc[i])", "first ? acc[i] : over(acc[i], load_quad(to))"),
+    ),
+    *_rows(
+        "pyramid.cl",
+        ("index", "for (int m = source; m < size.peels && n > 0; m++)", "for (int m = 0; m < size.peels && n > 0; m++)"),
+        ("compare", "& (alpha >= 0.5f)) ? w : depth;", "& (alpha > 0.5f)) ? w : depth;"),
+        ("sign", "image += (1.0f - image.s33337777bbbbffff) * c;", "image += c;"),
+        ("drop", "to_b = b < 0.0f ? (float16)(MAXFLOAT) : to_b;", ""),
+        ("clamp", "needed = needed > 1.0f ? (float16)(1.0f) : needed;", ""),
+        ("swap", "return clamp01(matting_axis(w) * ramp.z + ramp.w);", "return clamp01(matting_axis(w) * ramp.x + ramp.y);"),
+        ("compare", "int16 take = (rise <= 0.0f) & (r > 0.0f);", "int16 take = (rise <= 0.0f) & (r >= 0.0f);"),
+        ("weight", "float4 scale = count > 0.0f ? 1.0f / count : (float4)(0.0f);", "float4 scale = count > 0.0f ? (float4)(0.25f) : (float4)(0.0f);"),
+        ("off by one", "fine_row & 1 ? near + 1 : near - 1", "fine_row & 1 ? near : near - 1"),
+        ("swap", "float16 even = 0.75f * mid + 0.25f * left, odd", "float16 even = 0.75f * mid + 0.25f * right, odd"),
+        ("off by one", "clamp_index(2 * row - 1, sub.w - 1) - sub.x", "clamp_index(2 * row - 2, sub.w - 1) - sub.x"),
+        ("off by one", "clamp_index(2 * x - 1 + 4 * t + j, sub.z - 1)", "clamp_index(2 * x - 1 + 4 * t + j, sub.z - 2)"),
+        ("off by one", "clamp_index(2 * row - 1 + j, fine.z - 1)", "clamp_index(2 * row + j, fine.z - 1)"),
+        ("weight", "store_quad(blur + ((size_t)coarse.x + (size_t)row * coarse.w + x) * 4, 0.0625f *",
+         "store_quad(blur + ((size_t)coarse.x + (size_t)row * coarse.w + x) * 4, 0.0630f *"),
+        ("drop", "store_quad(fill_inv + to, w < 0.0f ? filled : w);", "store_quad(fill_inv + to, filled);"),
+        ("drop", "float4 scale = coverage > PYRAMID_MIN_COVERAGE ? 1.0f / coverage : (float4)(0.0f);",
+         "float4 scale = coverage > PYRAMID_MIN_COVERAGE ? (float4)(1.0f) : (float4)(0.0f);"),
+        ("sign", "sum[q] += (1.0f - sum[q].s33337777bbbbffff) * quad[q];", "sum[q] += (1.0f + sum[q].s33337777bbbbffff) * quad[q];"),
+    ),
+    *_rows(
+        "multiview.cl",
+        ("sign", "float16 c = w * c1 + c0;", "float16 c = w * c1 - c0;"),
+        ("compare", "to_a = to_a < to_b ? to_a : to_b;\n    return to_a > MULTIVIEW_CONNECTED",
+         "to_a = to_a > to_b ? to_a : to_b;\n    return to_a > MULTIVIEW_CONNECTED"),
+        ("off by one", "step = 1 << (level - 1);", "step = 1 << level;"),
+        ("off by one", "const int x0 = cx > r ? cx - r : 0,", "const int x0 = cx > r ? cx - r + 1 : 0,"),
+        ("swap", "float4 weight = v.s37bf >= MULTIVIEW_OPAQUE ? ins[q] : owns[q];", "float4 weight = ins[q];"),
+        ("drop", "quad[q] += v * spread((1.0f - quad[q].s37bf) * weight);", "quad[q] += v * spread(weight);"),
+        ("weight", "t < -radius || t > radius ? edge : 1.0f", "1.0f"),
+        ("off by one", "for (int t = -radius; t <= radius; t++) sum += *(", "for (int t = -radius; t < radius; t++) sum += *("),
+        ("index", "line[4 * (inside - x0 + MULTIVIEW_HALO) + c]", "line[4 * (inside - x0 + MULTIVIEW_HALO - 1) + c]"),
+        ("drop", "v = front + (1.0f - front.w) * v;", "v = front + v;"),
+        ("sign", "const int x = x0 + by.x, row = y + by.y,", "const int x = x0 - by.x, row = y + by.y,"),
+        ("drop", "alpha < 0.0f ? (float16)(0.0f) : left[q] * c[q];", "left[q] * c[q];"),
+        ("weight", "v = p[j] / known;", "v = p[j] / (float)rays.y;"),
+        ("compare", "const int is_void = through > MULTIVIEW_CLOSED || alpha == 0.0f;", "const int is_void = through > MULTIVIEW_CLOSED;"),
+    ),
+    *_rows(
+        "lightfield.cl",
+        ("swap", "return bits & 0x80000000u ? bits : ~(bits | 0x80000000u);", "return bits & 0x80000000u ? ~bits : bits | 0x80000000u;"),
+        ("clamp", "if (absolute(d) > STEEP_PX) return MAXFLOAT;", ""),
+        ("compare", "e) < absolute(best) ? e : best;", "e) > absolute(best) ? e : best;"),
+        ("sign", "(d < 0.0f ? -0.5f : 0.5f)", "(d < 0.0f ? 0.5f : 0.5f)"),
+        ("compare", "is_closed = other.y >= 0.0f && other.x > own.y;", "is_closed = other.y >= 0.0f;"),
+        ("drop", "(front.y - own.x) + 3.0f <=", "(front.y - own.x) * 0.25f <="),
+        ("off by one", "first = ((at) + 128) >> 8;", "first = ((at) + 255) >> 8;"),
+        ("off by one", "end = ((at) + 511) >> 8;", "end = ((at) + 255) >> 8;"),
+        ("drop", "#define EDGE_OVERLAP 8 ", "#define EDGE_OVERLAP (-8) "),
+        ("sign", "EDGE_REACH(l, -TO_INT(TO_FLOAT(l) * slope_x), shear_x)", "EDGE_REACH(l, TO_INT(TO_FLOAT(l) * slope_x), shear_x)"),
+        ("drop", "if (to[1] == key) atomic_min(to, at);", "if (to[1] == key) *to = at;"),
+        ("compare", "return other >= 0.0f && absolute(lens.c1)", "return absolute(lens.c1)"),
+        ("drop", "return !LIGHTFIELD_GLASS || (a.w >= OPAQUE_ALPHA)", "return 1 || (a.w >= OPAQUE_ALPHA)"),
+        ("sign", "int step_x = ray_x < x << 8 ? -1 : 1,", "int step_x = ray_x < x << 8 ? 1 : -1,"),
+        ("weight", "const float weight = (i ? 0.25f : 0.5f) * (j ? 0.25f : 0.5f);", "const float weight = 0.25f;"),
+        ("sign", "const int16 ray_y = top - convert_int16(c * shift_y);", "const int16 ray_y = top + convert_int16(c * shift_y);"),
+        ("index", "q = load_pixel(corner + size.width * 4);", "q = load_pixel(corner + size.width * 4 + 4);"),
+        ("weight", "const float weight = 1.0f / (tangent * tangent);", "const float weight = 1.0f / tangent;"),
+        ("swap", "return a.y < b.y || (a.y == b.y && a.x < b.x);", "return a.y > b.y || (a.y == b.y && a.x < b.x);"),
+        ("drop", "weights[b + i] += is_hole ? weight * ray.w : weight;", "weights[b + i] += weight;"),
+        ("compare", "if (m > 0 && depth == 0.0f &&", "if (m > 0 && depth >= 0.0f &&"),
+    ),
+]  # fmt: skip
