@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Make .venv ready, from nothing: setup.sh core|test
+# Make .venv ready, from nothing: setup.sh core|test|dev|bench|oclgrind|rusticl
 #
 # Installs what is missing and no more; a second run is instant. Uses apt-get (with sudo when not root) for three
 # things that pip cannot bring: Python's own venv module, what PoCL links its kernels with, and an EGL/OpenGL driver.
@@ -67,6 +67,12 @@ make_venv() {
     rm -rf "$venv"
     "$python" -m venv "$venv" || { rm -rf "$venv"; fail "$python could not create $venv"; }
 }
+
+# Tools of the system alone, for checks: nothing of Python's.
+case $extra in
+oclgrind) command -v oclgrind >/dev/null || apt_install oclgrind || say "oclgrind cannot be installed"; exit 0 ;;
+rusticl) apt_install mesa-opencl-icd || say "mesa-opencl-icd cannot be installed"; exit 0 ;;
+esac
 
 # An existing .venv whose interpreter is gone (an upgrade of the system, a moved folder) is made anew.
 "$venv/bin/python" -c 'import pip' 2>/dev/null || make_venv

@@ -38,7 +38,7 @@ def test_memory_is_left_alone_and_written_before_it_is_read(case: Case, canaried
 
 
 def test_no_kernel_was_left_out(seen: set[str], canaried: Device, request: pytest.FixtureRequest) -> None:
-    if len(request.session.items) < len(CASES):
+    if sum(item.name.startswith("test_memory") for item in request.session.items) < len(CASES):
         pytest.skip("only some of the cases were run")
     missing = kernels_in_sources() - seen
     if not canaried.traits.has_int64_atomics:

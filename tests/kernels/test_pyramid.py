@@ -106,6 +106,18 @@ def test_flatten_and_slope_meet_the_oracle(device: Device, size: tuple[int, int]
     assert_close(slope[:, :, : frame.width, 0][known], done.stack.slope[known], "pyramid_slope")
 
 
+def test_half_covered_counts_as_covered(device: Device) -> None:
+    """A pixel stands at the peel that covers half of it, exactly half included."""
+    color = np.ones((2, 6, 21, 4), np.float32)
+    color[0] = 0.5
+    depth = np.full((2, 6, 21), 3.0, np.float32)
+    depth[0] = 1.5
+    frame = LayeredFrame(color, depth, Camera(21, 6, 40.0))
+    done = cut(device, frame, 8.0, "pyramid_slope", ["rgb_flat_inv"])
+    inverse = done.outputs["rgb_flat_inv"].reshape(len(done.stack.color), 6, -1)
+    np.testing.assert_allclose(inverse[0, :, :21], 1.0 / 1.5, rtol=1e-6)
+
+
 @pytest.mark.parametrize("alpha", ["true", "red"])
 def test_flatten_carries_alpha(device: Device, alpha: str) -> None:
     """As the gather blur and the second run over frames that are not opaque take it."""

@@ -69,7 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             worst = min(values, key=lambda name: values[name])
             least = min(least, values[worst])
             same = sum(value == math.inf for value in values.values())
-            cells.append(f"{values[worst]:.1f} ({worst.removeprefix(method + ' ')}); {same} of {len(values)} to the bit")
+            cells.append(
+                f"{values[worst]:.1f} ({worst.removeprefix(method + ' ')}); {same} of {len(values)} to the bit"
+            )
         print(f"| {method} | " + " | ".join(cells) + " |", flush=True)
     return int(least < LEAST_DB)
 

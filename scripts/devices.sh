@@ -1,0 +1,72 @@
+#!/usr/bin/env bash
+# Run the tests of kernels and methods on every OpenCL driver that can be installed: devices.sh [pocl|intel|rusticl|...]
+#
+# What is tested, by name (all of them unless named):
+#   two      two PoCL devices of one platform at once
+#   small    PoCL, told to be a device with work-groups of 64 and 32 KiB of local memory
+#   gpu      the same, told to be no CPU as well: the forms that GPUs get
+#   intel    Intel's CPU runtime, from PyPI
+#   rusticl  Mesa's rusticl on llvmpipe; slow, so a few tiny frames
+#   agree    PoCL against Intel's runtime: the same pictures within 70 dB
+# Installs into .venv and with apt-get; what cannot be had is skipped in so many words.
+set -uo pipefail
+cd "$(dirname "$0")/.."
+
+venv=$PWD/.venv
+[ -x "$venv/bin/python" ] || { echo "run 'make test-devices'" >&2; exit 1; }
+python=${PYTHON_OF_TESTS:-$venv/bin/python}
+prefix=$("$python" -c 'import sys; print(sys.prefix)')
+icd=$(mktemp -d)
+trap 'rm -rf "$icd"' EXIT
+fast=(tests/kernels tests/methods tests/test_every_kernel.py tests/hard_cases -k "not reference and not full_hd and not dense")
+failed=() skipped=()
+
+skip() { echo "SKIPPED $1: $2" >&2; skipped+=("$1"); }
+test_on() { # name, then variables, then -- and what to run
+    local name=$1; shift
+    local variables=()
+    while [ "$1" != -- ]; do variables+=("$1"); shift; done
+    shift
+    echo "== $name" >&2
+    env "${variables[@]}" CLDOF_REQUIRE_DEVICE=1 "$python" -m pytest -q -p no:cacheprovider "$@" || failed+=("$name")
+}
+
+have_intel() {
+    local library=$prefix/lib/libintelocl.so
+    [ -e "$library" ] || "$python" -m pip install -qq intel-opencl-rt intel-cmplr-lib-rt >&2 || true
+    [ -e "$library" ] || return 1
+    echo "$library" >"$icd/intel.icd"
+}
+have_rusticl() {
+    local found=/etc/OpenCL/vendors/rusticl.icd
+    [ -e "$found" ] || scripts/setup.sh rusticl || true
+    [ -e "$found" ] || return 1
+    cp "$found" "$icd/rusticl.icd"
+}
+
+for name in ${*:-two small gpu intel rusticl agree}; do
+    rm -f "$icd"/*
+    case $name in
+    two) test_on two POCL_DEVICES="pthread pthread" CLDOF_TEST_DEVICE=portable -- tests/host tests/test_every_kernel.py ;;
+    small) test_on small CLDOF_TEST_LIMITS=64,32768 -- "${fast[@]}" ;;
+    gpu) test_on gpu CLDOF_TEST_LIMITS=64,32768,gpu -- "${fast[@]}" ;;
+    intel)
+        have_intel || { skip intel "intel-opencl-rt could not be installed"; continue; }
+        test_on intel OCL_ICD_VENDORS="$icd" LD_LIBRARY_PATH="$prefix/lib" CLDOF_TEST_DEVICE="intel(r) opencl" -- "${fast[@]}"
+        ;;
+    rusticl)
+        have_rusticl || { skip rusticl "mesa-opencl-icd could not be installed"; continue; }
+        test_on rusticl OCL_ICD_VENDORS="$icd" RUSTICL_ENABLE=llvmpipe CLDOF_TEST_DEVICE=llvmpipe -- \
+            tests/test_every_kernel.py -k "pixel or one"
+        ;;
+    agree)
+        have_intel || { skip agree "intel-opencl-rt could not be installed"; continue; }
+        echo "== agree" >&2
+        OCL_ICD_VENDORS="$icd" LD_LIBRARY_PATH="$prefix/lib" "$python" -m tests.tools.agreement \
+            PoCL=portable "Intel=intel(r) opencl" || failed+=(agree)
+        ;;
+    *) echo "no such device: $name" >&2; exit 2 ;;
+    esac
+done
+echo "failed: ${failed[*]:-none}; skipped: ${skipped[*]:-none}" >&2
+[ ${#failed[@]} = 0 ]

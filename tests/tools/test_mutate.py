@@ -1,0 +1,61 @@
+"""The tool that breaks kernels, on two mutants: one that must be noticed and one that changes nothing."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.tools.checked import messages_of
+from tests.tools.mutants import MUTANTS, SUITES, Mutant
+from tests.tools.mutate import ROOT, Workshop, check_anchors
+
+SUITE = [["tests/kernels/test_frame.py"]]
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
+    return Workshop(ROOT, tmp_path_factory.mktemp("workshop"))
+
+
+@pytest.mark.parametrize(
+    ("new", "verdict"),
+    [
+        ("float inverse = 2.0f / z[x];", "caught"),
+        ("float inverse = 1.0f / (z[x]);", "survived"),
+        ("float inverse = 1.0f / nothing_of_that_name;", "broken"),
+    ],
+)
+def test_a_mutant_meets_its_fate(workshop: Workshop, device_info: object, new: str, verdict: str) -> None:
+    mutant = Mutant("frame.cl", "float inverse = 1.0f / z[x];", new, "weight")
+    before = (workshop.tree / "cldof" / "kernels" / "frame.cl").read_text()
+    outcome = workshop.try_out(mutant, SUITE, 300.0)
+    assert outcome.verdict == verdict, outcome.by
+    assert ("test_inverse_depth" in outcome.by) == (verdict == "caught")
+    assert (workshop.tree / "cldof" / "kernels" / "frame.cl").read_text() == before
+    assert workshop.tree.resolve() != Path(ROOT).resolve()
+
+
+def test_the_list_fits_the_kernels() -> None:
+    """Every anchor is there once; every kernel file has mutants, and every file a suite."""
+    assert not check_anchors(MUTANTS)
+    kernels = {path.name for path in (ROOT / "cldof" / "kernels").glob("*.cl*")}
+    assert {mutant.file for mutant in MUTANTS} == kernels == set(SUITES)
+    assert len(MUTANTS) >= 40
+    assert max(Counter(mutant.name for mutant in MUTANTS).values()) == 1
+
+
+def test_an_anchor_that_is_gone_is_named() -> None:
+    wrong = check_anchors([Mutant("frame.cl", "no such line", "other", "drop")])
+    assert len(wrong) == 1 and "0 times" in wrong[0]
+
+
+def test_messages_of_the_simulator_are_counted() -> None:
+    log = (
+        "\nInvalid write of size 4 at global memory address 0x1000000010\n\tKernel: toy_overrun\n\tEntity: Global"
+        "\n\n\nWrite-write data race at local memory address 0x20\n\tKernel: toy_race\n\n\tFirst entity: 0\n"
+    )
+    found = messages_of(log * 2)
+    assert found[("Invalid write of size 4 at global memory address 0x..", "toy_overrun")] == 2
+    assert found[("Write-write data race at local memory address 0x..", "toy_race")] == 2
