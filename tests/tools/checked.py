@@ -45,7 +45,7 @@ def messages_of(log: str) -> Counter[tuple[str, str]]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code: 1 when something was found, a case failed or a kernel was not run."""
     parser = argparse.ArgumentParser(prog="tests.tools.checked", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--only", default="", help="cases whose name contains this")
+    parser.add_argument("--only", nargs="+", default=[""], help="cases whose name contains one of these")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--uninitialized", action="store_true")
     parser.add_argument("--inside", help=argparse.SUPPRESS)
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if shutil.which("oclgrind") is None:
         print("oclgrind is not installed (Debian and Ubuntu: apt-get install oclgrind)", file=sys.stderr)
         return 1
-    chosen = [number for number, case in enumerate(CASES) if options.only in case.name]
+    chosen = [number for number, case in enumerate(CASES) if any(text in case.name for text in options.only)]
     # Far apart, so that each process has cases of several methods and none is much longer than the others.
     count = -(-len(chosen) // _PER_PROCESS)
     groups = [chosen[first::count] for first in range(count)]
@@ -68,7 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for (what, kernel), number in sorted(found.items()):
         print(f"{kernel}: {what} ({number} times)")
     print("\n".join(failures))
-    missing = set() if options.only else kernels_in_sources() - seen - {"lightfield_packed"}  # no 64-bit atomics there
+    missing = (
+        set() if any(options.only) else kernels_in_sources() - seen - {"lightfield_packed"}
+    )  # no 64-bit atomics there
     if missing:
         print(f"not run: {', '.join(sorted(missing))}; tests/every_kernel.py needs a case")
     seconds = time.perf_counter() - started

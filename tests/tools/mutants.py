@@ -218,7 +218,7 @@ MUTANTS: list[Mutant] = [
         ("off by one", "first = ((at) + 128) >> 8;", "first = ((at) + 255) >> 8;"),
         ("off by one", "end = ((at) + 511) >> 8;", "end = ((at) + 255) >> 8;"),
         ("drop", "#define EDGE_OVERLAP 8 ", "#define EDGE_OVERLAP (-8) "),
-        ("sign", "EDGE_REACH(l, -TO_INT(TO_FLOAT(l) * slope_x), shear_x)", "EDGE_REACH(l, TO_INT(TO_FLOAT(l) * slope_x), shear_x)"),
+        ("sign", "EDGE_REACH(l, -TO_INT(", "EDGE_REACH(l, TO_INT("),
         ("drop", "if (to[1] == key) atomic_min(to, at);", "if (to[1] == key) *to = at;"),
         ("compare", "return other >= 0.0f && absolute(lens.c1)", "return absolute(lens.c1)"),
         ("drop", "return !LIGHTFIELD_GLASS || (a.w >= OPAQUE_ALPHA)", "return 1 || (a.w >= OPAQUE_ALPHA)"),
