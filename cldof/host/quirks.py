@@ -21,6 +21,7 @@ __all__ = ["QUIRKS", "Effect", "Quirk", "effects_of", "prepare_environment", "us
 
 
 _MOST_PROCESSES = 64
+_LOCK = "cldof.lock"
 # Locks on directories, for as long as the process lives: the environment that they go with is the process's, too.
 _claimed: dict[Path, IO[bytes]] = {}
 
@@ -168,7 +169,7 @@ def _claim(directory: Path) -> Path:
             return candidate
         try:
             candidate.mkdir(parents=True, exist_ok=True)
-            lock = open(candidate / "cldof.lock", "wb")  # noqa: SIM115 - held until the process ends
+            lock = open(candidate / _LOCK, "wb")  # noqa: SIM115 - held until the process ends
         except OSError:
             break
         try:
@@ -184,7 +185,9 @@ def _claim(directory: Path) -> Path:
 
 def _drop_cut_programs(directory: Path) -> None:
     """Remove programs that end before their table of sections does, as a power failure or a full disk leaves them."""
-    for folder, _, names in os.walk(directory):
+    for folder, below, names in os.walk(directory):
+        # Those of other processes, which may be writing there.
+        below[:] = [name for name in below if not os.path.exists(os.path.join(folder, name, _LOCK))]
         for name in names:
             if name.endswith(".so"):
                 with suppress(OSError):

@@ -37,6 +37,18 @@ def test_a_cache_directory_that_works_is_left_alone(monkeypatch: pytest.MonkeyPa
     assert os.environ["POCL_CACHE_DIR"] == str(tmp_path / "not yet" / "there")
 
 
+def test_programs_cut_short_are_removed_but_not_those_that_others_write(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    for folder in ("own", "cldof-1/theirs"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "kernel.so").write_bytes(b"\x7fELF\x02")
+    (tmp_path / "cldof-1" / "cldof.lock").touch()
+    prepare_environment()
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.so")] == ["cldof-1/theirs/kernel.so"]
+
+
 @pytest.mark.parametrize("variable", ["POCL_CACHE_DIR", "XDG_CACHE_HOME", "HOME"])
 def test_a_cache_directory_that_cannot_work_is_replaced(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, variable: str
