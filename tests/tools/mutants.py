@@ -102,7 +102,7 @@ MUTANTS: list[Mutant] = [
     ),
     *_rows(
         "frame.cl",
-        ("compare", "inverse > 0.0f || rgba[4 * x + 3] > 0.0f", "inverse > 0.0f || rgba[4 * x + 3] >= 0.0f"),
+        ("compare", "w[x] = there > 0.0f || rgba[4 * x + 3] > 0.0f", "w[x] = there > 0.0f || rgba[4 * x + 3] >= 0.0f"),
         ("drop", "for (int x = width; x < pitch; x++) w[x] = EMPTY;", ""),
         ("weight", "1.0f / (float)(factor * factor)", "1.0f / (float)(factor)"),
         ("off by one", "for (int i = 0; i < factor; i++) sum", "for (int i = 1; i < factor; i++) sum"),
