@@ -692,7 +692,9 @@ def _aimed(
     """A first look at the scene, and the lens that follows from it; ``whole`` looks at every pixel."""
     from .method_options import shades_surfaces
 
-    surface = arguments.method != _ACCUMULATE and shades_surfaces(arguments.method, settings.options)
+    # What auto knows of times and errors is without surfaces.
+    has_choice = arguments.method not in (_ACCUMULATE, _AUTO)
+    surface = has_choice and shades_surfaces(arguments.method, settings.options)
     with watch.step("preview"):
         # On a pixel the depth has to be that pixel's own; for anything else a fraction of them is enough.
         shrink = 1 if whole or arguments.focus_at else _PREVIEW_SHRINK

@@ -509,6 +509,17 @@ def test_the_command_line_reports_the_choice(
     assert "times too short" in capsys.readouterr().out
 
 
+def test_the_command_line_captures_for_auto(
+    device_info: DeviceInfo, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    require_opengl()
+    base = ["--size", "48x48", "--device", str(device_info.index), "--method", "auto"]
+    assert main(["render", "floating", "-o", "a.png", *base, "--max-error", "20dB"]) == 0
+    assert "auto    " in capsys.readouterr().out
+    assert main(["sequence", "floating", "-o", "#.png", "--frames", "2", *base, "--max-ms", "1e4"]) == 0
+    assert (folder / "1.png").exists()
+
+
 @pytest.mark.parametrize(
     "options, says",
     [
