@@ -39,7 +39,7 @@ class Measurements:
     def add(self, key: Key, value: float, bound: float) -> None:
         """Keep the value if it is the worst against its bound so far; NaN is the worst of all."""
         old = self.worst.get(key)
-        if old is None or value != value or value - bound > old[0] - old[1]:
+        if old is None or value != value or (old[0] == old[0] and value - bound > old[0] - old[1]):
             self.worst[key] = (value, bound)
 
     def save(self, path: Path) -> None:
@@ -64,7 +64,8 @@ def driver_of(info: DeviceInfo) -> str:
     """A driver's short name and version."""
     names = {"Portable": "PoCL", "Intel": "Intel", "rusticl": "rusticl"}
     name = next((name for mark, name in names.items() if mark in info.platform), info.platform)
-    return f"{name} {info.driver_version.split()[0]}"
+    version = ".".join(info.driver_version.split()[0].split(".")[:2])
+    return f"{name} {version}"
 
 
 def _rounded(value: float) -> float:
