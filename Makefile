@@ -14,7 +14,7 @@ help:
 	@echo "make test   run all tests          (ARGS='-k lens' picks some)"
 	@echo "make stability  hard cases on every device, measured into docs/stability.md"
 	@echo "make test-devices   the kernel and method tests on every OpenCL driver that can be installed, and how they agree"
-	@echo "make test-oclgrind  every kernel under a simulator that checks each access to memory (2 minutes)"
+	@echo "make test-oclgrind  every kernel under a simulator that checks each access to memory (minutes)"
 	@echo "make mutants        faults put into the kernels: how many the tests notice (an hour)"
 	@echo "make bench  speed of each pass, then accuracy and time of every method, quickly (4 minutes)"
 	@echo "            ARGS=speed or ARGS=--quick: one of them; ARGS='--scenes row': any 'cldof bench' options"
