@@ -87,7 +87,17 @@ LADDERS: dict[str, tuple[Rung, ...]] = {
         Rung("16 views", {"views": 16}),
         Rung("default", quick=True, shown=True),
         Rung("64 views", {"views": 64}),
+        Rung("128 views", {"views": 128}),
         Rung("1 peel", peels=1),
+        Rung("2 peels", peels=2),
+        Rung("2x2 support", {"support": "2x2"}),
+        Rung("no mip levels", {"mip": False}),
+        Rung("shaded from the centre", {"view_dependent": False}),
+        Rung(
+            "paper's form",
+            {"support": "2x2", "lookup": "winner", "dither": False, "pattern": "halton", "view_dependent": False},
+            peels=1,
+        ),
     ),
 }
 
