@@ -53,8 +53,6 @@ _NEGLIGIBLE_COC_PX = 1e-3
 # Work-items that a CPU core should get, so that none waits for the last one.
 _ITEMS_PER_CORE = 2
 _WINNER_BYTES = 8
-# Highlights that turn by less than this share of their width over the lens's radius look the same from all of it.
-_LEAST_TURN = 0.1
 # Pixels along a silhouette that say where in its pixel it runs, and one beside it.
 _STAIRCASE_PX = 17
 
@@ -169,7 +167,7 @@ class LightField:
         if not frame.is_opaque:
             farthest = 0.0  # the void is a surface at infinity
         largest = max(abs(c1 * farthest + c0), abs(c1 * nearest + c0))
-        is_shaded = self.view_dependent and frame.lobe_turn_per_m * lens.aperture_radius_m > _LEAST_TURN
+        is_shaded = self.view_dependent and frame.is_glossy_through(lens)
         count = self.views if largest >= _NEGLIGIBLE_COC_PX or is_shaded else 1
         # A ray's share of the CoC is pi C^2 / views; a level of the pyramid is as wide as a box of twice its texels.
         cell = math.sqrt(math.pi / count) / 2.0
