@@ -1,6 +1,7 @@
 """`python -m bench`: what `cldof bench` does, from a checkout.
 
-`python -m bench speed` times passes and blurs, `python -m bench auto` judges ``method="auto"``.
+`python -m bench speed` times passes and blurs, `python -m bench auto` judges ``method="auto"``, `python -m bench
+planned` tells what planning is worth.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import sys
 from cldof.benchmark.command import add_arguments, bench
 from cldof.errors import CldofError
 
-from . import auto, speed
+from . import auto, planned, speed
 
 
 def main() -> int:
@@ -35,6 +36,15 @@ def main() -> int:
             parser.add_argument("--output", metavar="FILE", help="keep every case as JSON")
             arguments = parser.parse_args(sys.argv[2:])
             auto.report(arguments.device, arguments.busy, tuple(arguments.scenes), arguments.output)
+            return 0
+        if sys.argv[1:2] == ["planned"]:
+            parser = argparse.ArgumentParser(prog="bench planned", description="What planning is worth, by method.")
+            parser.add_argument("--device", help="index, cpu, gpu or part of a name (as cldof render --device)")
+            parser.add_argument("--size", type=int, default=1024, help="pixels a side (default 1024)")
+            parser.add_argument("--runs", type=int, default=5, help="frames to time (default 5)")
+            parser.add_argument("--output", metavar="FILE", help="keep the numbers as JSON")
+            arguments = parser.parse_args(sys.argv[2:])
+            planned.report(arguments.device, arguments.size, arguments.runs, arguments.output)
             return 0
         parser = argparse.ArgumentParser(prog="bench", description=__doc__)
         add_arguments(parser)

@@ -25,7 +25,17 @@ from .host.passes import Access, Buffer, FrameProgram, Param, Pass, Role, read, 
 from .lens import Lens
 from .methods.base import FrameShape, Method, Plan, struct_scalar
 
-__all__ = ["BINS", "MAX_CHANGE", "TILE", "Decision", "FramePlan", "SceneStats", "everything", "plan_frame"]
+__all__ = [
+    "BINS",
+    "MAX_CHANGE",
+    "TILE",
+    "Decision",
+    "FramePlan",
+    "SceneStats",
+    "everything",
+    "peels_needed",
+    "plan_frame",
+]
 
 # Constants of kernels/stats.cl.
 TILE = 16
@@ -326,7 +336,13 @@ def everything(method: Method, frame: LayeredFrame, lens: Lens) -> FramePlan:
 
 
 def plan_frame(
-    method: Method, frame: LayeredFrame, lens: Lens, stats: SceneStats, traits: Traits, max_change: float = MAX_CHANGE
+    method: Method,
+    frame: LayeredFrame,
+    lens: Lens,
+    stats: SceneStats,
+    traits: Traits,
+    max_change: float = MAX_CHANGE,
+    is_last: bool = False,
 ) -> FramePlan:
     """Decide what to compute.
 
@@ -337,18 +353,21 @@ def plan_frame(
         For its camera and its range of depths.
     lens : Lens
     stats : SceneStats
-        Of this frame; of another one, no bound holds.
+        Of this frame, or with ``is_last`` of the one before.
     traits : Traits
         Of the device.
     max_change : float
         What may change a pixel at most, linear units. 0 leaves out only what changes nothing.
+    is_last : bool
+        Allow for some motion: a tile more around everything, and no peel left out. The bound then holds where the frame
+        looks like the one before.
 
     Returns
     -------
     FramePlan
     """
     base = method.plan(frame, lens)
-    return _Planner(method, base, frame, lens, stats, traits, max_change).plan()
+    return _Planner(method, base, frame, lens, stats, traits, max_change, is_last).plan()
 
 
 class _Planner:
@@ -363,9 +382,11 @@ class _Planner:
         stats: SceneStats,
         traits: Traits,
         max_change: float,
+        is_last: bool,
     ) -> None:
         self.method, self.base, self.stats, self.max_change = method, base, stats, max_change
         self.shape = stats.shape
+        self.is_last = is_last
         self.c1, self.c0 = lens.coc_coefficients(frame.camera)
         # Half of what is allowed is for what lies beyond windows, half for what is taken to be in focus.
         self.contrast = max(stats.brightest, 1e-6)
@@ -400,6 +421,7 @@ class _Planner:
             "error_bound": bound,
             "peels_used": peels if windows != () else 0,
             "windows": sizes,
+            "statistics": "last" if self.is_last else "frame",
             "scene": self.stats.summary(),
         }
         inner = self.base.structure if windows is None or windows else None
@@ -493,6 +515,8 @@ class _Planner:
     def _in_focus(self) -> tuple[tuple[Window, ...] | None, Decision]:
         """The parts of the frame that have to be computed, None for all of it."""
         name = "tiles in focus"
+        if getattr(self.method, "supersample", 1) > 1:
+            return None, Decision("whole frame", True, "the method averages the samples of a pixel by itself")
         if self.c1 == 0.0:
             return (), Decision(name, False, "a pinhole blurs nothing: its image is copied", 0.0, 1.0)
         if self.locality is None:
@@ -500,8 +524,9 @@ class _Planner:
         bound = self._bounds()
         allowed = self.max_change / 2.0
         active = bound > allowed
-        if self.locality.rim_px:
-            active = _spread(active, math.ceil(self.locality.rim_px / TILE)) > 0.0
+        rim = math.ceil(self.locality.rim_px / TILE) + self.is_last
+        if rim:
+            active = _spread(active, rim) > 0.0
         share = float((active * self.stats.pixels).sum() / self.stats.pixels.sum())
         error = float(bound[~active].max(initial=0.0))
         if not active.any():
@@ -631,10 +656,10 @@ class _Planner:
     def _revealed(self) -> NDArray[np.bool_]:
         """Tiles in which a peel may show, (M, ty, tx)."""
         stats, locality = self.stats, self.locality
-        there = stats.slots > 0.0
+        there = (stats.slots > 0.0) | self.is_last
         if not self.shape.is_opaque:
             there[1:] |= there[:-1]  # where a peel has nothing the void begins, and hides what is behind
-        if locality is None or (not self.shape.is_opaque and locality.spreads):
+        if self.is_last or locality is None or (not self.shape.is_opaque and locality.spreads):
             return there
         if locality.spreads:
             # Where several layers lie behind one another light may come from as far as both are spread.
@@ -732,6 +757,61 @@ class _Planner:
         if not guessed:
             reason = "a peel stands behind all that is taken away; only what lies beyond the frame's edges is guessed"
         return Decision("disocclusion", True, reason)
+
+
+def peels_needed(stats: SceneStats, lens: Lens, camera: Camera, max_change: float = MAX_CHANGE) -> tuple[int, str]:
+    """How many peels of a scene a blur may reveal: what to ask a capture for.
+
+    Parameters
+    ----------
+    stats : SceneStats
+        Of a frame of the scene with as many peels as might be of use; it may be a small one.
+    lens : Lens
+    camera : Camera
+        Of that frame.
+    max_change : float
+        A surface counts as closed if its CoC changes by so little from one pixel to the next that no more light than
+        this gets past it.
+
+    Returns
+    -------
+    peels : int
+    reason : str
+        In numbers.
+
+    Notes
+    -----
+    A slot in peel m+1 is seen by some point of the lens only if the surface before it ends, or opens, within as many
+    pixels as both are blurred. What is too small for the frame at hand is not known of.
+    """
+    c1, c0 = lens.coc_coefficients(camera)
+    layers = stats.shape.layers
+    if c1 == 0.0 and not stats.shape.has_glass:
+        return 1, "a pinhole sees the first surface only"
+    there = stats.slots > 0.0
+    ends = [
+        c1 * float(w) + c0 for w in (stats.farthest[there].min(initial=np.inf), stats.nearest.max()) if np.isfinite(w)
+    ]
+    reach = sum(abs(coc) for coc in ends)
+    radius = math.ceil(reach / TILE) + 1
+    step_px = max_change / 2.0 / max(stats.brightest, 1e-6)
+    is_hidden = np.zeros(stats.tiles, bool)
+    needed = 1
+    for peel in range(1, layers):
+        closed = stats.is_closed[peel - 1] & (abs(c1) * stats.step[peel - 1] <= step_px)
+        is_hidden |= _spread((~closed).astype(np.float64), radius) == 0.0
+        if bool((there[peel] & ~is_hidden).any()):
+            needed = peel + 1
+    shares = stats.slots.sum(axis=(1, 2)) / stats.pixels.sum()
+    if needed == layers:
+        return needed, f"a blur of {reach:.1f} px may reveal all of {_count(layers, 'peel')}"
+    rest = float(shares[needed:].max())
+    what = (
+        "hold nothing"
+        if rest == 0.0
+        else f"cover {rest:.1%} of the view and cannot be revealed by {reach:.1f} px of blur"
+    )
+    return needed, f"the peels after {needed} {what}"
 
 
 def planned_program(method: Method, shape: FrameShape, plan: FramePlan, traits: Traits) -> FrameProgram:

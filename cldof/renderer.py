@@ -258,6 +258,10 @@ class Renderer:
         everything, for comparison.
     max_change : float
         What leaving out may change a pixel by at most, in linear units; 0 leaves out only what changes nothing.
+    statistics : {"frame", "last"}
+        Plan a new frame by its own statistics, for which :meth:`render_async` waits, once per frame that was not seen
+        before and until the device has come to it; or by those of the frame before, without waiting, with a tile to
+        spare for what has moved. The plan's bound then holds where the frame looks like the one before.
     **options
         The method's, for instance ``layers=12`` (:class:`cldof.methods.layered.Layered`).
 
@@ -282,10 +286,13 @@ class Renderer:
         supersample: int = 1,
         planned: bool = True,
         max_change: float = MAX_CHANGE,
+        statistics: str = "frame",
         **options: Any,
     ) -> None:
         if not (isinstance(max_change, int | float) and 0.0 <= max_change < math.inf):
             raise InputError(f"max_change is {max_change!r}; it must be a number of at least 0, in linear units.")
+        if statistics not in ("frame", "last"):
+            raise InputError(f"statistics is {statistics!r}; choose one of frame, last.")
         self.method = _auto(options) if method == "auto" else make_method(method, **options)
         if isinstance(self.method, Auto) and not planned:
             raise InputError("method='auto' chooses by the planner's statistics; leave planned=True.")
@@ -302,7 +309,8 @@ class Renderer:
         self._slots = frames_in_flight
         # A method may take in all samples of a pixel at once; otherwise they are rendered like pixels and averaged.
         self._supersample = supersample
-        self._planned, self._max_change = planned, float(max_change)
+        self._planned, self._max_change, self._statistics = planned, float(max_change), statistics
+        self._latest: SceneStats | None = None
         if supersample > 1 and hasattr(self.method, "supersampled"):
             self.method = self.method.supersampled(supersample)
         self._taken_in = int(getattr(self.method, "supersample", 1))
@@ -360,7 +368,7 @@ class Renderer:
                 return self._start(held, lens, self.method, image, started)[0]
             assert held.stats is not None
             is_alone = self._automatic.under_way == 0
-            choice, feature = self._automatic.choose(held.stats.wait(), lens, frame.camera)
+            choice, feature = self._automatic.choose(self._known(held)[0], lens, frame.camera)
             faded = None
             if choice.fades_from is not None:
                 before = self._automatic.method(choice.fades_from)
@@ -430,6 +438,19 @@ class Renderer:
             if error is None:
                 raise
 
+    def _known(self, held: _DeviceFrame) -> tuple[SceneStats, bool]:
+        """Statistics to plan by, and whether they are those of a frame before."""
+        assert held.stats is not None
+        if self._statistics == "last" and not held.stats.have_arrived():
+            for other in reversed(self._frames.values()):
+                if other.shape == held.shape and other.stats is not None and other.stats.have_arrived():
+                    self._latest = other.stats.wait()
+                    break
+            if self._latest is not None and self._latest.shape == held.shape:
+                return self._latest, True
+        self._latest = held.stats.wait()
+        return self._latest, False
+
     def _plan(self, held: _DeviceFrame, lens: Lens, method: Method) -> FramePlan:
         """What to compute; kept with the frame for the lenses last seen."""
         key = (method, lens)
@@ -438,7 +459,10 @@ class Renderer:
             if held.stats is None:
                 plan = everything(method, held.frame, lens)
             else:
-                plan = plan_frame(method, held.frame, lens, held.stats.wait(), self.device.traits, self._max_change)
+                stats, is_last = self._known(held)
+                plan = plan_frame(method, held.frame, lens, stats, self.device.traits, self._max_change, is_last)
+                if is_last:
+                    return plan
             while len(held.plans) >= _KEPT_PLANS:
                 held.plans.pop(next(iter(held.plans)))
             held.plans[key] = plan

@@ -1,0 +1,133 @@
+"""What planning is worth: the time of scenes that call for little, as ratios to one that calls for everything.
+
+Scenes are textured walls with boxes before them and windows through them. Times are processor time of the passes, all
+threads together, the least of several frames, so that other work on the machine does not count; the unit is a copy of
+16 MB on the device in the same run.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cldof import Camera, LayeredFrame, Lens, Renderer
+from cldof.host import opencl as cl
+from cldof.methods import METHODS
+
+__all__ = ["CASES", "make_frame", "measure", "report"]
+
+Box = tuple[float, float, float, float, float]
+
+# Boxes as x0, y0, x1, y1 in shares of the frame and depth in metres; depth of the wall; focus distance.
+CASES: dict[str, tuple[list[Box], float, float]] = {
+    "full": ([(0.0, 0.0, 0.33, 1.0, 1.0), (0.33, 0.0, 0.67, 1.0, 2.0)], 8.0, 2.0),
+    "all in focus": ([], 2.0, 2.0),
+    "only far blur": ([(0.0, 0.0, 0.5, 1.0, 2.0)], 8.0, 2.0),
+    "10 % of tiles": ([(0.36, 0.36, 0.64, 0.64, 1.0)], 2.0, 2.0),
+}
+# Of the nearest box, in px for 1024 px.
+_COC_PX = 20.0
+_PEELS = 4
+
+
+def make_frame(size: int, boxes: list[Box], wall_m: float) -> LayeredFrame:
+    """A wall and boxes before it; the second peel is the wall behind them, two more are empty."""
+    rng = np.random.default_rng(0)
+
+    def paint() -> np.ndarray:
+        cells = rng.random((size // 4 + 1, size // 4 + 1, 3), np.float32)
+        color = np.ones((size, size, 4), np.float32)
+        color[..., :3] = cells.repeat(4, 0).repeat(4, 1)[:size, :size]
+        return color
+
+    color = np.zeros((_PEELS, size, size, 4), np.float32)
+    depth = np.full((_PEELS, size, size), np.inf, np.float32)
+    color[0], depth[0] = paint(), wall_m
+    for x0, y0, x1, y1, at in boxes:
+        place = (slice(int(y0 * size), int(y1 * size)), slice(int(x0 * size), int(x1 * size)))
+        color[1][place], depth[1][place] = color[0][place], depth[0][place]
+        color[0][place], depth[0][place] = paint()[place], at
+    return LayeredFrame(color, depth, Camera(size, size, 40.0))
+
+
+def _least(run: Callable[[], Any], times: int) -> float:
+    """Processor time in ms."""
+    run()
+    taken = []
+    for _ in range(times):
+        start = time.process_time()
+        run()
+        taken.append(time.process_time() - start)
+    return min(taken) * 1e3
+
+
+def _copy_ms(renderer: Renderer, times: int) -> float:
+    pool, queue = renderer.device.pool, renderer.device.queue
+    nbytes = 16 << 20
+    source, target = pool.acquire(nbytes), pool.acquire(nbytes)
+    cl.enqueue_fill_buffer(queue, source, b"\0\0\0\0", 0, nbytes).wait()
+    taken = _least(lambda: cl.enqueue_copy(queue, target, source, byte_count=nbytes).wait(), 4 * times)
+    pool.release(source)
+    pool.release(target)
+    return taken
+
+
+def measure(method: str, device: str | None, size: int, times: int) -> list[dict[str, Any]]:
+    """One row per case: milliseconds planned and not, for a frame known already and for a new one."""
+    rows = []
+    out = np.empty((size, size, 4), np.float32)
+    with Renderer(method, device=device) as on, Renderer(method, device=device, planned=False) as off:
+        copy = _copy_ms(on, times)
+        # What comes after the passes: the image on its way to the host.
+        target = on.device.pool.acquire(out.nbytes)
+        download = _least(lambda: on.device.pool.download(target, out).wait(), 4 * times)
+        for case, (boxes, wall, focus) in CASES.items():
+            frame = make_frame(size, boxes, wall)
+            lens = Lens(_COC_PX * size / 1024 * 2.0 / frame.camera.focal_px, focus)
+            plan = on.render(frame, lens).plan
+            change = float(np.abs(on.render(frame, lens).image - off.render(frame, lens).image).max())
+
+            def new(renderer: Renderer, frame: LayeredFrame = frame, lens: Lens = lens) -> Callable[[], Any]:
+                fresh = []
+                for _ in range(times + 1):
+                    one = LayeredFrame(frame.color, frame.depth, frame.camera)
+                    _ = one.is_opaque, one.has_glass, one.inverse_depth_range
+                    fresh.append(one)
+                return lambda: renderer.render(fresh.pop(), lens, out=out)
+
+            rows.append(
+                {
+                    "method": method,
+                    "case": case,
+                    "copy_ms": copy,
+                    "planned_ms": _least(lambda r=on, f=frame, v=lens: r.render(f, v, out=out), times) - download,
+                    "everything_ms": _least(lambda r=off, f=frame, v=lens: r.render(f, v, out=out), times) - download,
+                    "planned_new_ms": _least(new(on), times) - download,
+                    "everything_new_ms": _least(new(off), times) - download,
+                    "windows": plan.summary["windows"],
+                    "error_bound": plan.error_bound,
+                    "change": change,
+                }
+            )
+    return rows
+
+
+def report(device: str | None, size: int, times: int, output: str | None) -> None:
+    """Measure every method, print a table, and keep the numbers."""
+    rows = [row for method in sorted(METHODS) for row in measure(method, device, size, times)]
+    print("| method | scene | planned, copies | of full | of everything on | new frame: of everything on | change |")
+    print("|---|---|---|---|---|---|---|")
+    for row in rows:
+        full = next(one for one in rows if one["method"] == row["method"] and one["case"] == "full")
+        print(
+            f"| {row['method']} | {row['case']} | {row['planned_ms'] / row['copy_ms']:.1f} "
+            f"| {row['planned_ms'] / full['planned_ms']:.0%} | {row['planned_ms'] / row['everything_ms']:.0%} "
+            f"| {row['planned_new_ms'] / row['everything_new_ms']:.0%} | {row['change']:.1g} |"
+        )
+    if output:
+        Path(output).write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,54 @@
+"""Plans of every built-in scene, by every method, against everything switched on."""
+
+from collections.abc import Iterator
+from functools import cache
+
+import numpy as np
+import pytest
+
+from cldof import LayeredFrame, Lens, Renderer
+from cldof.capture.scenes import builtin_scene, builtin_scenes
+from cldof.host.device import DeviceInfo
+from cldof.methods import METHODS
+from tests.opengl import require_opengl
+from tests.planner.test_ablation import Pair, check
+
+SIZE = 80
+
+
+@pytest.fixture(scope="module", params=sorted(METHODS))
+def pair(request: pytest.FixtureRequest, device_info: DeviceInfo) -> Iterator[Pair]:
+    with (
+        Renderer(request.param, device=device_info.index) as planned,
+        Renderer(request.param, device=device_info.index, planned=False) as full,
+    ):
+        yield planned, full
+
+
+@cache
+def captured(name: str) -> tuple[LayeredFrame, tuple[Lens, ...]]:
+    """A frame of four peels, and lenses: its own, a narrow one, and one focused on the nearest surface."""
+    from cldof.capture.peel import DepthPeeler
+
+    scene = builtin_scene(name)
+    radius, focus = scene.aperture_radius_m, scene.focus_distance_m
+    assert radius is not None
+    assert focus is not None
+    with DepthPeeler(SIZE, SIZE) as peeler:
+        frame = peeler.peel(scene, scene.camera_for(SIZE, SIZE), layers=4, guard_px=4)
+    nearest = float(frame.depth.min())
+    return frame, (Lens(radius, focus), Lens(radius / 50, focus), Lens(radius, nearest))
+
+
+@pytest.mark.parametrize("name", list(builtin_scenes()))
+def test_nothing_left_out_shows(pair: Pair, name: str) -> None:
+    require_opengl()
+    frame, lenses = captured(name)
+    for lens in lenses:
+        plan = check(pair, frame, lens)
+        # Every effect is decided on, one way or the other.
+        effects = {one.effect for one in plan.decisions}
+        assert {"near side", "far side"} <= effects
+        assert effects & {"tiles in focus", "whole frame"}
+    image = pair[0].render(frame, Lens(0.0, lenses[0].focus_distance_m)).image
+    np.testing.assert_array_equal(image, frame.pinhole_image())
