@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from .capture.peel import DepthPeeler
     from .capture.scene import Scene
+    from .renderer import Renderer
 
 __all__ = ["main"]
 
@@ -60,7 +61,7 @@ _AUTO_SKY_COC_SHARE = 0.06
 _GUARD_SHARE = 0.10
 # The first, cheap look at a scene finds depths, not pictures.
 _PREVIEW_SHRINK = 4
-_PREVIEW_LAYERS = 2
+_PREVIEW_LAYERS = _DEFAULT_PEELS
 _FULL_FRAME_HEIGHT_MM = 24.0
 _PATIENCE_S = 2.0
 # Steps of so many parts or more get a bar.
@@ -192,7 +193,12 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
         ".exr and .npy are linear, anything else is sRGB",
     )
     view.add_argument("--transparent", action="store_true", help="leave out the background; alpha tells where it was")
-    view.add_argument("--peels", type=int, metavar="N", help=f"layers to capture at most (default {_DEFAULT_PEELS})")
+    view.add_argument(
+        "--peels",
+        type=int,
+        metavar="N",
+        help=f"layers to capture at most (default: what a blur may reveal, up to {_DEFAULT_PEELS})",
+    )
     view.add_argument(
         "--azimuth", type=_number, metavar="DEG", help="see files without a camera from here, +z to +x (default 30)"
     )
@@ -423,8 +429,10 @@ def _rendered(
         renderer = stack.enter_context(
             Renderer(arguments.method, device=arguments.device, profile=True, supersample=factor, **settings.options)
         )
-    capture = _load_shot if _is_saved_frame(arguments.scene) else _capture_shot
-    shot = capture(arguments, settings, factor, watch)
+    if _is_saved_frame(arguments.scene):
+        shot = _load_shot(arguments, settings, factor, watch)
+    else:
+        shot = _capture_shot(arguments, settings, factor, watch, renderer)
     with watch.step("render"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         result = renderer.render(shot.frame, shot.lens)
@@ -639,7 +647,9 @@ def _load_shot(arguments: argparse.Namespace, settings: _Settings, factor: int, 
     return _Shot(frame, lens, camera, remarks, None)
 
 
-def _capture_shot(arguments: argparse.Namespace, settings: _Settings, factor: int, watch: _Stopwatch) -> _Shot:
+def _capture_shot(
+    arguments: argparse.Namespace, settings: _Settings, factor: int, watch: _Stopwatch, renderer: Renderer
+) -> _Shot:
     from .capture.peel import DepthPeeler
 
     with watch.step("scene"):
@@ -647,8 +657,21 @@ def _capture_shot(arguments: argparse.Namespace, settings: _Settings, factor: in
     camera = _camera(arguments, scene)
     with DepthPeeler(camera.width, camera.height) as peeler:
         preview, lens, remarks = _aimed(arguments, settings, peeler, scene, camera, watch)
+        if arguments.peels is None:
+            arguments.peels = _peels_for(renderer, preview, lens, remarks)
         frame = _capture(arguments, peeler, scene, camera, preview, [lens], remarks, factor, watch)
         return _Shot(frame, lens, camera, remarks, peeler.device)
+
+
+def _peels_for(renderer: Renderer, preview: LayeredFrame, lens: Lens, remarks: list[str]) -> int:
+    """As many peels as a blur may reveal by the preview, and one more for what is too small for it."""
+    from .planner import peels_needed
+
+    needed, why = peels_needed(renderer.stats(preview), lens, preview.camera)
+    peels = min(needed + (lens.aperture_radius_m > 0.0), _DEFAULT_PEELS)
+    if peels < _DEFAULT_PEELS:
+        remarks.append(f"{peels} of {_DEFAULT_PEELS} peels captured: {why} (--peels {_DEFAULT_PEELS} captures all)")
+    return peels
 
 
 def _capture(

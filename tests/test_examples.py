@@ -14,14 +14,15 @@ from cldof.host.device import DeviceInfo
 from tests.opengl import require_opengl
 
 ROOT = Path(__file__).parent.parent
-ARGUMENTS = {
+ARGUMENTS: dict[str, list[str]] = {
+    "explain": [],
     "render_npz": ["image.png", "--size", "96"],
     "render_scene": ["image.png", "--size", "96", "--scene", "floating"],
     "glossy": ["image.png", "--size", "96"],
     "loop": ["--size", "96", "--frames", "4"],
     "rack_focus": [".", "--size", "96", "--frames", "4"],
 }
-WITHOUT_OPENGL = {"render_npz"}
+WITHOUT_OPENGL = {"explain", "render_npz"}
 
 
 def test_all_examples_are_run() -> None:
@@ -41,5 +42,7 @@ def test_example(name: str, device_info: DeviceInfo, tmp_path: Path) -> None:
     if "image.png" in ARGUMENTS[name]:
         with Image.open(tmp_path / "image.png") as picture:
             assert picture.size == (96, 96)
+    elif name == "explain":
+        assert done.stdout.count("Expected work") == 3
     else:
         assert done.stdout.count("ms") == 4
