@@ -166,6 +166,13 @@ class LayeredFrame:
         return (0.0 if sky else 1.0 / farthest), 1.0 / nearest
 
     @cached_property
+    def farthest_opaque(self) -> NDArray[np.float32]:
+        """Inverse depth (1/m) of the farthest opaque slot of each pixel, (H, W); inf where there is none."""
+        depth = np.where(self.color[..., 3] >= 1.0, self.depth, np.float32(0.0)).max(axis=0)
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.float32(1.0) / depth)
+
+    @cached_property
     def is_opaque(self) -> bool:
         """True when no pixel of the pinhole image lets the void behind the scene through."""
         transmittance = 1.0 - self.color[0, ..., 3]

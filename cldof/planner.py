@@ -60,7 +60,7 @@ _SIDE_SAVING = 0.45
 # Copying the image, whatever else is left out.
 _LEAST_SHARE = 0.01
 # Windows begin and end at multiples of this, in px.
-_GRID = 64
+_GRID = 32
 # Reaches are rounded up to these, in tiles.
 _RINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 10**6)
 # Inverse depth of what is past a row, as kernels/common.clh has it.
@@ -385,6 +385,7 @@ class _Planner:
         is_last: bool,
     ) -> None:
         self.method, self.base, self.stats, self.max_change = method, base, stats, max_change
+        self.frame = frame
         self.shape = stats.shape
         self.is_last = is_last
         self.c1, self.c0 = lens.coc_coefficients(frame.camera)
@@ -598,10 +599,17 @@ class _Planner:
             x1, y1 = min(x1, shape.width - shape.guard_px), min(y1, shape.height - shape.guard_px)
             if min(x0, y0, shape.width - x1, shape.height - y1) < edge:
                 return False
-        # A closed peel that is far enough is not culled, and then there is nothing to guess.
-        farther = np.where(self.stats.is_closed, self._coc(np.maximum(self.stats.nearest, 0.0)), -np.inf)
-        known = farther.max(axis=0) >= limit + self.slack_px
-        return all(bool(known[_tiles_of(window)].all()) for window in windows)
+        # An opaque slot that is far enough is not culled, and then there is nothing to guess.
+        return all(bool(self._known(limit)[_tiles_of(window)].all()) for window in windows)
+
+    def _known(self, limit: float) -> NDArray[np.bool_]:
+        """Tiles in which every pixel has something opaque with a CoC of at least ``limit``, (ty, tx)."""
+        nearest = self.frame.farthest_opaque
+        for axis in (0, 1):
+            nearest = np.maximum.reduceat(nearest, range(0, nearest.shape[axis], TILE), axis=axis)
+        return np.asarray(
+            (nearest < np.inf) & (self._coc(np.where(nearest < np.inf, nearest, 0.0)) >= limit + self.slack_px)
+        )
 
     def _windows(self, active: NDArray[np.bool_]) -> tuple[Window, ...]:
         assert self.locality is not None
@@ -749,13 +757,10 @@ class _Planner:
             yield Decision("empty depth layers", True, reason)
 
     def _disocclusion(self, windows: tuple[Window, ...] | None) -> Decision:
-        stats = self.stats
         limit = self.locality.guesses_nearer_than_px if self.locality is not None else math.inf
-        farther = np.where(stats.is_closed, self._coc(np.maximum(stats.nearest, 0.0)), -np.inf).max(axis=0)
-        guessed = float(((farther < limit) * stats.pixels).sum() / stats.pixels.sum())
-        reason = f"in {guessed:.0%} of the tiles something may be missing behind what is taken away"
-        if not guessed:
-            reason = "a peel stands behind all that is taken away; only what lies beyond the frame's edges is guessed"
+        reason = "what is taken away is filled from the peel behind it, and where there is none from around it"
+        if windows is not None and all(bool(self._known(limit)[_tiles_of(window)].all()) for window in windows):
+            reason = "a peel stands behind all that is taken away; only what lies beyond the edges is guessed"
         return Decision("disocclusion", True, reason)
 
 

@@ -216,8 +216,8 @@ class Pyramid:
             return np.minimum(share, 1.0)
 
         return Locality(
-            max(64, 2**steps),
-            4 * 2**steps + _MARGIN,
+            max(2 * _MARGIN, 2**steps),
+            math.ceil(3.5 * 2**steps) + 4,
             reach_px,
             leak,
             # The farthest sub-image culls most.
