@@ -35,6 +35,12 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No progress lines on stderr, however busy the machine is; what else is there is the command's."""
+    monkeypatch.setattr("cldof.cli._PATIENCE_S", 1e6)
+
+
 @pytest.fixture
 def on_device(device_info: DeviceInfo, monkeypatch: pytest.MonkeyPatch) -> DeviceInfo:
     """The device under test, chosen through the environment."""

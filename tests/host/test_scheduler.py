@@ -199,14 +199,17 @@ def test_resubmission_waits_for_the_frame_before_it(toy_out_of_order: Device) ->
             assert (out == value).all()
 
 
-def test_frames_in_flight_are_independent(any_queue: Device) -> None:
+def test_frames_in_flight_are_independent(any_queue: Device, make_gate: Callable[[Device], Any]) -> None:
+    """All three wait at a gate, so that none is over when the next one asks for a batch."""
     program = chain(6, "toy_late_reverse")
     hosts = [np.full(N, value, np.float32) for value in range(3)]
     sources = [any_queue.pool.to_device(host) for host in hosts]
     with scheduler.FrameRing(program, any_queue, slots=3) as ring:
         for _ in range(3):
-            frames = [ring.submit({"in": source.buffer}, wait_for=source.waits) for source in sources]
+            gate = make_gate(any_queue)
+            frames = [ring.submit({"in": one.buffer}, wait_for=[*one.waits, gate.event]) for one in sources]
             assert len({id(frame.batch) for frame in frames}) == 3
+            gate.open()
             for value, frame in enumerate(frames):
                 assert (output(frame.batch, frame) == value + 6).all()
 
