@@ -103,17 +103,19 @@ class PassOptions:
 
     ``lens_reach_m``: back faces of single-sided materials are dropped unless a lens point within this radius sees their
     front; 0 drops all that this view sees from behind, None keeps them all. ``stop_at_opaque``: nothing is peeled
-    behind an opaque fragment. ``surface``: write the surface buffers too.
+    behind an opaque fragment. ``surface``: write the surface buffers too. ``lod_bias``: mip levels that textures are
+    coarser by.
     """
 
     lens_reach_m: float | None = None
     stop_at_opaque: bool = False
     surface: bool = False
+    lod_bias: float = 0.0
 
     @classmethod
-    def for_layers(cls, lens: Lens | None, surface: bool) -> PassOptions:
+    def for_layers(cls, lens: Lens | None, surface: bool, lod_bias: float = 0.0) -> PassOptions:
         """A Gaussian lens has no rim: beyond twice its radius lie 3e-4 of its light."""
-        return cls(None if lens is None else 2.0 * lens.aperture_radius_m, surface=surface)
+        return cls(None if lens is None else 2.0 * lens.aperture_radius_m, surface=surface, lod_bias=lod_bias)
 
 
 class Target:
@@ -387,6 +389,7 @@ class SceneRenderer(pyrender.Renderer):  # type: ignore[misc]
                 "zero_to_one": self._zero_to_one,
                 "lens_reach": -1.0 if options.lens_reach_m is None else float(options.lens_reach_m),
                 "stop_at_opaque": options.stop_at_opaque,
+                "lod_bias": float(options.lod_bias),
             }
             surface = {"SURFACE": 1} if options.surface else {}
             around = {}

@@ -6,6 +6,7 @@ deeper than the layer before. Here the test is relative and on inverse depth (sh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
@@ -79,6 +80,7 @@ class DepthPeeler:
         guard_px: int = 0,
         surface: bool = False,
         progress: Progress | None = None,
+        lod_bias: float = 0.0,
     ) -> LayeredFrame:
         """Capture up to ``layers`` layers of ``scene``.
 
@@ -98,6 +100,9 @@ class DepthPeeler:
             Fill the frame's surface buffers and lighting, with which methods shade from the points of the lens.
         progress : callable, optional
             Called with (layers done, layers at most).
+        lod_bias : float
+            Mip levels that textures are coarser by. ``log2(n)`` gives a frame captured n times larger the textures of
+            the image that it is for.
 
         Returns
         -------
@@ -115,12 +120,14 @@ class DepthPeeler:
             raise InputError(f"layers is {layers!r}; it must be a whole number, at least 1.")
         if isinstance(guard_px, bool) or guard_px != int(guard_px) or guard_px < 0:
             raise InputError(f"guard_px is {guard_px!r}; it must be a whole number of pixels, at least 0.")
+        if not math.isfinite(lod_bias):
+            raise InputError(f"lod_bias is {lod_bias!r}; it must be a finite number of mip levels.")
         layers, guard_px = int(layers), int(guard_px)
         from .draw import PassOptions, View
 
         camera = camera or scene.camera_for(*self._size)
         view = View(camera.with_guard(guard_px))
-        options = PassOptions.for_layers(lens, surface)
+        options = PassOptions.for_layers(lens, surface, lod_bias)
         shape = (layers, view.camera.height, view.camera.width)
         color, depth = np.empty((*shape, 4), np.float32), np.empty(shape, np.float32)
         extra = np.empty((3, *shape, 4), np.float32) if surface else None

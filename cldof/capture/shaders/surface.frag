@@ -18,6 +18,7 @@ uniform vec3 emissive;
 uniform float metallic;
 uniform float roughness;
 uniform float alpha_cutoff;
+uniform float lod_bias;        // mip levels that textures are coarser by
 #ifdef BASE_TEXTURE
 uniform sampler2D base_texture;
 #endif
@@ -39,15 +40,15 @@ void main() {
     vec4 base = base_color * vertex_color;
     vec3 emission = emissive;
 #ifdef BASE_TEXTURE
-    base *= texture(base_texture, surface_uv);
+    base *= texture(base_texture, surface_uv, lod_bias);
 #endif
 #ifdef EMISSIVE_TEXTURE
-    emission *= texture(emissive_texture, surface_uv).rgb;
+    emission *= texture(emissive_texture, surface_uv, lod_bias).rgb;
 #endif
     float metal = metallic;
     float rough = roughness;
 #ifdef ROUGHNESS_TEXTURE
-    vec4 texel = texture(metallic_roughness_texture, surface_uv);
+    vec4 texel = texture(metallic_roughness_texture, surface_uv, lod_bias);
     metal *= texel.b;
     rough *= texel.g;
 #endif
