@@ -303,6 +303,21 @@ def checker(alphas: tuple[int, int, int, int]) -> Image.Image:
     return image
 
 
+def test_a_larger_capture_can_have_the_textures_of_the_image(peeler: DepthPeeler) -> None:
+    """The middle one of 3 x 3 samples is the pixel's own, once its mip level is, too."""
+    noise = Image.fromarray(np.random.default_rng(1).integers(0, 256, (256, 256, 3), np.uint8))
+    scene = Scene("noise", (quad(3.0, 1.5, flat(base_color_texture=noise)),))
+    plain = peeler.peel(scene, camera_at(), layers=1).color[0]
+    larger = camera_at().supersampled(3)
+    sharp, coarse = (
+        peeler.peel(scene, larger, layers=1, lod_bias=bias).color[0, 1::3, 1::3] for bias in (0, math.log2(3))
+    )
+    assert np.abs(coarse - plain).max() <= 1e-2  # drivers work levels out roughly
+    assert np.abs(sharp - plain).max() >= 0.05
+    with pytest.raises(InputError, match="lod_bias is nan"):
+        peeler.peel(scene, lod_bias=math.nan)
+
+
 def test_alpha_modes(peeler: DepthPeeler) -> None:
     image, half = checker((0, 64, 153, 255)), 2.0 * math.tan(math.radians(22.5))
     back = quad(5.0, material=flat((0.0, 1.0, 0.0)))

@@ -1,5 +1,7 @@
 """The multiview method against the accumulation reference through a disc, on the scenes that we ship."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -41,21 +43,29 @@ def test_crossing_branches_stand_apart(device_info: DeviceInfo) -> None:
     assert min(without) <= 18.0
 
 
-@pytest.mark.parametrize(("name", "least_db"), [("sky", 28.5), ("lights", 30.0)])
-def test_several_samples_a_pixel_show_what_one_cannot(name: str, least_db: float, device_info: DeviceInfo) -> None:
-    """Twigs in focus and lamps a pixel wide, captured three times as large; rays are as many as without."""
+@pytest.mark.parametrize(
+    ("name", "gain_db", "least_db"), [("sky", 3.0, 28.5), ("lights", 3.0, 30.0), ("plane", -1.0, 0.0)]
+)
+def test_several_samples_a_pixel_show_what_one_cannot(
+    name: str, gain_db: float, least_db: float, device_info: DeviceInfo
+) -> None:
+    """Twigs in focus and lamps a pixel wide, captured three times as large; rays are as many as without.
+
+    Textures far from their own size, as of plane, are no worse for it.
+    """
     from cldof.capture.peel import DepthPeeler
 
     one = judged(name, "disc")
     camera = builtin_scene(name).camera_for(SIZE, SIZE).supersampled(3)
+    guard = 3 * one.frame.guard_px
     with DepthPeeler(camera.width, camera.height) as peeler:
-        frame = peeler.peel(builtin_scene(name), camera, layers=6, lens=one.lens, guard_px=3 * one.frame.guard_px)
+        frame = peeler.peel(builtin_scene(name), camera, layers=6, lens=one.lens, guard_px=guard, lod_bias=math.log2(3))
     with Renderer("multiview", device=device_info.index) as renderer:
         single = psnr(renderer.render(one.frame, one.lens).image, one.reference)
     with Renderer("multiview", device=device_info.index, supersample=3, antialias=False) as renderer:
         image = renderer.render(frame, one.lens).image
     assert image.shape == one.reference.shape
-    assert psnr(image, one.reference) >= max(least_db, single + 3.0)
+    assert psnr(image, one.reference) >= max(least_db, single + gain_db)
 
 
 def test_view_dependent_shading_shows(device_info: DeviceInfo) -> None:
