@@ -111,7 +111,7 @@ class _Blocking:
 
     rows: int  # FIR_ROWS
     group: int  # FIR_GROUP
-    segment: int
+    segment: int  # pixels of a row that a work-group owns, where local memory has room for them
     local_size: int
     largest_fir_sigma: float  # above it the recursive engine is faster
 
@@ -119,8 +119,11 @@ class _Blocking:
     def defines(self) -> tuple[tuple[str, int], ...]:
         return (("FIR_ROWS", self.rows), ("FIR_GROUP", self.group))
 
-    def lines_bytes(self, radius: int) -> int:
-        return self.rows * (self.segment + 2 * _halo(radius)) * 16
+    def segment_within(self, local_bytes: int, radius: int) -> int:
+        """The longest segment, in whole tiles, whose lines fit with what a filter reads around them; 0 for none."""
+        # A byte more a pixel is plenty for the words that layered_step keeps per tile.
+        room = (local_bytes - 64) // (self.rows * 16 + 1) - 2 * _halo(radius)
+        return max(0, min(self.segment, room // _TILE * _TILE))
 
 
 # On a CPU one work-item owns a block of lines that stays in its L1/L2 cache. The values for GPUs are reasoned, not
@@ -397,7 +400,7 @@ class _Engines:
     def is_recursive(self, sigma: float) -> bool:
         if sigma <= 0.0:
             return False
-        fits = self.blocking.lines_bytes(gaussian.fir_radius(sigma)) + 256 <= self.local_limit
+        fits = self.blocking.segment_within(self.local_limit, gaussian.fir_radius(sigma)) > 0
         if self.method.engine == "fir" and not fits:
             raise InputError(
                 f"layered: engine='fir' cannot blur by sigma {sigma:.1f} px on this device: its local memory of "
@@ -518,7 +521,8 @@ class _Builder:
         self._image_buffer(name)
         self.buffers.append(Buffer(reached, self.tiles_x * self.tiles_y * 4))
         blocking = self.blocking
-        segment = min(blocking.segment, -(-self.shape.width // _TILE) * _TILE)
+        longest = blocking.segment_within(self.engines.local_limit, radius_out)
+        segment = min(max(longest, _TILE), -(-self.shape.width // _TILE) * _TILE)
         step = struct_scalar(
             _STEP, layer, int(in_front), image.below, radius_in, taps_in, radius_out, taps_out, segment
         )

@@ -1,5 +1,6 @@
 """The layered method end to end: against its float64 twin, and what every method promises (DESIGN section 4)."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,12 +10,13 @@ from hypothesis import strategies as st
 
 from cldof import Camera, InputError, LayeredFrame, Lens
 from cldof.host.device import Device
+from cldof.host.passes import Local
 from cldof.lens import GAUSSIAN_SIGMA
-from cldof.methods import gaussian
+from cldof.methods import FrameShape, gaussian
 from cldof.methods.layered import MAX_LAYERS, Layered, LayerStack, layer_coc, matting_functions
 from tests.frames import noise_frame, plane_frame
 from tests.oracles import layered as oracle
-from tests.running import render_frame
+from tests.running import inverse_depth, render_frame, run_program
 from tests.tolerances import assert_close
 
 
@@ -104,6 +106,25 @@ def test_a_constant_stays_constant(device: Device, depth: float, cascade: bool) 
     frame = plane_frame(image, depth)
     out = render(device, frame, Lens(20.0 / frame.camera.focal_px, 2.0), cascade=cascade)
     np.testing.assert_allclose(out, image, rtol=1e-5)
+
+
+@pytest.mark.parametrize("is_cpu", [True, False])
+def test_little_local_memory_takes_shorter_segments(device: Device, is_cpu: bool) -> None:
+    """The same bits on a device with 16 or 32 KiB as with all there is, on an image wider than the segments."""
+    frame = noise_frame(300, 20, 3)
+    shape, method = FrameShape.of(frame), Layered()
+    plan = method.plan(frame, Lens(6.0 / frame.camera.focal_px, 2.0))
+    inputs = {"color": frame.color, "inv_depth": inverse_depth(device, frame)}
+    images = []
+    for local_bytes in (device.traits.local_mem_bytes, 1 << 15, 1 << 14):
+        traits = dataclasses.replace(device.traits, local_mem_bytes=local_bytes, is_cpu=is_cpu)
+        program = method.program(shape, plan, traits)
+        asked = [sum(one.nbytes for one in step.args if isinstance(one, Local)) for step in program.passes]
+        assert max(asked) <= local_bytes
+        images.append(run_program(device, program, inputs, dict(plan.params), "image", (20, 300, 4)))
+    np.testing.assert_array_equal(images[0], images[1])
+    if not is_cpu:  # a CPU's rows leave so little room there that wider blurs become recursive
+        np.testing.assert_array_equal(images[0], images[2])
 
 
 def test_the_plane_in_focus_stays(device: Device) -> None:
