@@ -103,6 +103,7 @@ def _cases() -> Iterator[Case]:
     for options in (
         {"cone": False, "rays": 8},
         {"traversal": "peels", "cone": False, "rays": 8},
+        {"traversal": "peels", "refine_steps": 2, "layers": 8, "rays": 8},
         {"jitter": True, "rays": 8},
         {"jitter": True, "traversal": "peels", "cone": False, "rays": 8},
         {"adaptive": False, "cull": False, "rays": 8},

@@ -46,6 +46,10 @@
 #ifndef MULTIVIEW_PEELED
 #define MULTIVIEW_PEELED 0
 #endif
+/* With MULTIVIEW_PEELED: how often the way of a ray through a layer is halved around what it meets there. */
+#ifndef MULTIVIEW_REFINE
+#define MULTIVIEW_REFINE 0
+#endif
 /* 1: rays come in groups, each through layers of its own (shading_view), and are summed up in `parts`. */
 #ifndef MULTIVIEW_PARTS
 #define MULTIVIEW_PARTS 0
@@ -539,6 +543,60 @@ static inline void peeled_quads(float16 quad[4], const __global float *color, co
 }
 #endif
 
+#if MULTIVIEW_PEELED && MULTIVIEW_REFINE
+/* C of the first slot with something between two C, for each pixel of a run; MULTIVIEW_NOWHERE where there is none. */
+static inline float16 first_between(const __global float *inv_depth, const __global float *extent, MultiviewSize size,
+                                    float c1, float c0, float from, float to, int x, int row, int is_inside)
+{
+    float16 first = (float16)(MULTIVIEW_NOWHERE);
+    for (int m = 0; m < size.peels; m++) {
+        const size_t line = ((size_t)m * size.height + row) * size.pitch;
+        float16 near = run_of(inv_depth + line, x, is_inside, size.width) * c1 + c0;
+        float16 end = run_of(extent + line, x, is_inside, size.width);
+        near = near < to && end >= from ? near : (float16)(MULTIVIEW_NOWHERE);
+        first = near < first ? near : first;
+    }
+    return first;
+}
+
+/* Binary search: the ray of each pixel of a run through a layer, which it meets in the middle first. Where that shows
+ * something between the layer's bounds, the half before or behind the middle is halved in turn. All rays of a run are
+ * parallel: those in the same part of the layer have moved by the same whole number of pixels, and each part that some
+ * of them are in is one contiguous look-up. */
+static inline void refined_quads(float16 quad[4], const __global float *color, const __global float *inv_depth,
+                                 const __global float *extent, MultiviewSize size, float c1, float c0, float from,
+                                 float to, float2 limits, float2 point, int x0, int y)
+{
+    for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
+    float16 part = (float16)(0.0f);
+    for (int level = 0; level <= MULTIVIEW_REFINE; level++) {
+        const float length = (limits.y - limits.x) / (float)(1 << level);
+        float16 next = (float16)(-1.0f);
+        for (int k = 0; k < 1 << level; k++) {
+            float16 is_here = part == (float)k ? (float16)(1.0f) : (float16)(0.0f);
+            if (sum16(is_here) == 0.0f) continue;
+            const float c = limits.x + ((float)k + 0.5f) * length;
+            const int2 by = convert_int2_rtn(point * c + 0.5f);
+            const int x = x0 + by.x, row = clamp_index(y + by.y, size.height - 1);
+            const int is_inside = x >= 0 && x + MULTIVIEW_SPAN <= size.width && row == y + by.y;
+            if (level < MULTIVIEW_REFINE) {
+                float16 first = first_between(inv_depth, extent, size, c1, c0, from, to, x, row, is_inside);
+                float16 half_of = first < c ? (float16)(2.0f * k) : (float16)(2.0f * k + 1.0f);
+                if (level == 0) half_of = first < to ? half_of : (float16)(-1.0f);
+                next = is_here > 0.0f ? half_of : next;
+            } else {
+                float16 met[4];
+                peeled_quads(met, color, inv_depth, extent, size, c1, c0, from, to, x, row, is_inside,
+                             row != y + by.y);
+                const float4 here[4] = {is_here.s0123, is_here.s4567, is_here.s89ab, is_here.scdef};
+                for (int q = 0; q < 4; q++) quad[q] += met[q] * spread(here[q]);
+            }
+        }
+        part = next;
+    }
+}
+#endif
+
 /* What a lens of radius 0 sees: where every ray of a pixel is lost. */
 static inline float4 pinhole(const __global float *color, MultiviewSize size, int x, int y)
 {
@@ -592,6 +650,8 @@ __kernel void multiview_finish(__global float *restrict image, const __global fl
  * reads   layers    float[layers (+ 1)][height][pitch][4]
  *         color     float[peels][fine height][width][4]
  *         inv_depth, extent, bounds  as multiview_split has them; with MULTIVIEW_PEELED only, in place of layers
+ *         limits    float[layers + 1]  px, bounds that end, and
+ *         points    float2[rays]       as multiview_shifts has them; with MULTIVIEW_REFINE only
  *         lists     uint[cells_y][cells_x]
  *         sets      int[cells_y][cells_x]
  *         ray_sets  int2[sets * STRIDE^2]  first ray and number of rays
@@ -606,6 +666,9 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
 #if MULTIVIEW_PEELED
                               const __global float *restrict inv_depth, const __global float *restrict extent,
                               const __global float *restrict bounds, float c1, float c0,
+#if MULTIVIEW_REFINE
+                              const __global float *restrict limits, const __global float2 *restrict points,
+#endif
 #endif
                               MultiviewSize size, int guard
 #if MULTIVIEW_PARTS
@@ -649,8 +712,13 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
                 const int is_inside = x >= 0 && x + MULTIVIEW_SPAN <= size.width && row == inside;
 #if MULTIVIEW_PEELED
                 if (s < size.layers) {
+#if MULTIVIEW_REFINE
+                    refined_quads(c, color, inv_depth, extent, size, c1, c0, bounds[s], bounds[s + 1],
+                                  (float2)(limits[s], limits[s + 1]), points[rays.x + i], x0, y);
+#else
                     peeled_quads(c, color, inv_depth, extent, size, c1, c0, bounds[s], bounds[s + 1], x, inside,
                                  is_inside, row != inside);
+#endif
                 } else
 #endif
                 {

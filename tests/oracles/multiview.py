@@ -131,10 +131,80 @@ def trace(layers: np.ndarray, shifts: np.ndarray, color: np.ndarray, void: np.nd
             left = left * (1.0 - met[..., 3])
         if void is not None:
             known += np.where(inside, left * void[at_y, at_x], 0.0)
-    known += total[..., 3]
-    enough = known > 1e-4 * len(shifts)
+    return finish(total, known, len(shifts), color, void is None)
+
+
+def trace_peels(
+    color: np.ndarray,
+    columns: Slots,
+    bounds: np.ndarray,
+    limits: np.ndarray,
+    points: np.ndarray,
+    steps: int,
+    void: np.ndarray | None = None,
+) -> np.ndarray:
+    """All rays of all pixels, layer by layer through the peels: binary search for where each ray meets a layer.
+
+    Parameters
+    ----------
+    color : (M, H, W, 4)
+    columns : Slots
+    bounds, limits : (K + 1,)
+        Where layers begin in px of C; ``limits`` end, and are what is halved.
+    points : (rays, 2)
+        Right and down, per px of C.
+    steps : int
+        Times that the way through a layer is halved, at least 1.
+    void : (H, W), optional
+        For frames that are not opaque.
+
+    Returns
+    -------
+    (H, W, 4)
+    """
+    height, width = color.shape[1:3]
+    y, x = np.mgrid[:height, :width]
+
+    def at(point: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        column, row = (np.floor(p * c + 0.5).astype(int) + place for p, place in zip(point, (x, y), strict=True))
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        return np.clip(row, 0, height - 1), np.clip(column, 0, width - 1), inside
+
+    total, known = np.zeros((height, width, 4)), np.zeros((height, width))
+    for point in points:
+        left = np.ones((height, width))
+        for bound, limit in zip(pairwise(bounds), pairwise(limits), strict=True):
+            low, high = (np.full((height, width), end) for end in limit)
+            has_hit = np.ones((height, width), bool)
+            for step in range(steps):
+                middle = (low + high) / 2.0
+                row, column, _ = at(point, middle)
+                near, far = columns.near[:, row, column], columns.far[:, row, column]
+                first = np.where((near < bound[1]) & (far >= bound[0]), near, np.inf).min(axis=0)
+                if step == 0:
+                    has_hit = np.isfinite(first)
+                low, high = np.where(first < middle, low, middle), np.where(first < middle, middle, high)
+            row, column, inside = at(point, (low + high) / 2.0)
+            met = np.zeros((height, width, 4))
+            for rgba, near, far in zip(color, columns.near, columns.far, strict=True):
+                rgba, near, far = rgba[row, column], near[row, column], far[row, column]
+                reaches = has_hit & (near < bound[1]) & (far >= bound[0])
+                is_in = np.where(rgba[..., 3] >= 0.998, reaches, reaches & (near >= bound[0]))
+                met += rgba * ((1.0 - met[..., 3]) * is_in)[..., None]
+            total += np.where(inside, left, 0.0)[..., None] * met
+            left = left * (1.0 - met[..., 3])
+        if void is not None:
+            row, column, inside = at(point, (limits[-2] + limits[-1]) / 2.0)
+            known += np.where(inside, left * void[row, column], 0.0)
+    return finish(total, known, len(points), color, void is None)
+
+
+def finish(total: np.ndarray, known: np.ndarray, rays: int, color: np.ndarray, opaque: bool) -> np.ndarray:
+    """The image from what rays met; ``known`` is that of rays that met the void."""
+    known = known + total[..., 3]
+    enough = known > 1e-4 * rays
     result = total / np.where(enough, known, 1.0)[..., None]
-    if void is None:
+    if opaque:
         result[..., 3] = 1.0
     return np.where(enough[..., None], result, pinhole(color))
 
@@ -154,16 +224,24 @@ def render(
     guard: int = 0,
     scale: int = 1,
     least: float = 0.0,
+    halvings: int = 0,
+    limits: np.ndarray | None = None,
 ) -> np.ndarray:
-    """A whole frame with the same rays at every pixel; peels have ``scale`` times its pixels along x and y."""
+    """A whole frame with the same rays at every pixel; peels have ``scale`` times its pixels along x and y.
+
+    With ``halvings``, the search of ``trace_peels`` in the layers between ``limits``.
+    """
     color = color.astype(np.float64)
     columns = slots(inverse_depth, c1, c0, scale)
     coc = centres(color, columns, bounds, nominal, least)
+    inner = slice(guard, -guard or None)
+    if halvings:
+        image = trace_peels(color, columns, bounds, limits, points, halvings, None if opaque else past(color))
+        return image[inner, inner]
     layers = split(color, columns, bounds)
     cones = [cone(one, *window, scale) if window else one for one, window in zip(layers, windows, strict=True)]
     middle = color[:, scale // 2 :: scale, scale // 2 :: scale]
     image = trace(np.stack(cones), shifts(points, coc, scales), middle, None if opaque else past(color, scale))
-    inner = slice(guard, -guard or None)
     return image[inner, inner]
 
 
