@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from .camera import Camera
 from .errors import BudgetWarning, InputError
-from .lens import Lens
+from .lens import Lens, checked_number
 from .planner import SceneStats
 
 __all__ = ["FEATURES", "TARGETS", "Auto", "Budget", "Choice", "Chooser", "Curves", "Setting", "features", "load_curves"]
@@ -191,12 +191,12 @@ class Budget:
         if (max_error is None) == (max_ms is None):
             raise InputError("method='auto' needs max_error (such as '35dB') or max_ms (such as 40), one of both.")
         if max_ms is not None:
-            milliseconds = _number(max_ms, "max_ms")
+            milliseconds = checked_number(max_ms, "max_ms")
             if not 0.0 < milliseconds < math.inf:
                 raise InputError(f"max_ms is {max_ms!r}; it must be positive and finite.")
             return cls(max_ms=milliseconds)
         text = str(max_error).strip().lower()
-        value = _number(text.removesuffix("db"), "max_error")
+        value = checked_number(text.removesuffix("db"), "max_error")
         is_db = text.endswith("db") or value >= 5.0
         if not (0.0 < value < 1.0 or (is_db and 0.0 < value <= 200.0)):
             raise InputError(
@@ -208,13 +208,6 @@ class Budget:
     def min_db(self) -> float | None:
         """The error as PSNR."""
         return None if self.max_rms is None else -20.0 * math.log10(self.max_rms)
-
-
-def _number(value: Any, name: str) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} is {value!r}; it must be a number.") from None
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ class Aperture(ABC):
     ratio: float = field(default=1.0, kw_only=True)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "ratio", _number(self.ratio, "Aperture ratio"))
+        object.__setattr__(self, "ratio", checked_number(self.ratio, "Aperture ratio"))
         if not 0.0 < self.ratio < math.inf:
             raise InputError(f"Aperture ratio is {self.ratio}; height over width must be positive and finite.")
 
@@ -172,12 +172,12 @@ class PolygonAperture(Aperture):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        blades = _number(self.blades, "Aperture blades")
+        blades = checked_number(self.blades, "Aperture blades")
         if isinstance(self.blades, bool) or not 3 <= blades <= 64 or blades != int(blades):
             raise InputError(f"Aperture blades is {self.blades!r}; it must be a whole number, 3 to 64.")
         object.__setattr__(self, "blades", int(blades))
         for name in ("rotation_deg", "curvature"):
-            object.__setattr__(self, name, _number(getattr(self, name), f"Aperture {name}"))
+            object.__setattr__(self, name, checked_number(getattr(self, name), f"Aperture {name}"))
         if not math.isfinite(self.rotation_deg):
             raise InputError(f"Aperture rotation_deg is {self.rotation_deg}; it must be finite.")
         if not 0.0 <= self.curvature <= 1.0:
@@ -292,7 +292,8 @@ class ImageAperture(Aperture):
         return np.asarray(points / np.maximum(1.0, np.hypot(*points.T))[:, None])
 
 
-def _number(value: Any, name: str) -> float:
+def checked_number(value: Any, name: str) -> float:
+    """``value`` as a float; an InputError that names it otherwise."""
     try:
         return float(value)
     except (TypeError, ValueError):

@@ -23,7 +23,7 @@ from .frame import LayeredFrame
 from .host.device import Traits
 from .host.passes import Access, Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
 from .lens import Lens
-from .methods.base import FrameShape, Method, Plan, struct_scalar
+from .methods.base import EMPTY, FrameShape, Method, Plan, struct_scalar
 
 __all__ = [
     "BINS",
@@ -63,8 +63,6 @@ _LEAST_SHARE = 0.01
 _GRID = 32
 # Reaches are rounded up to these, in tiles.
 _RINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 10**6)
-# Inverse depth of what is past a row, as kernels/common.clh has it.
-EMPTY = -1.0
 
 _FLOAT = np.dtype(np.float32)
 _WINDOW = np.dtype([(name, np.int32) for name in ("x", "y", "x0", "y0", "x1", "y1")])
@@ -393,9 +391,6 @@ class _Planner:
         self.contrast = max(stats.brightest, 1e-6)
         tail = max_change / 2.0 / (_TAIL_USES * self.contrast)
         self.locality = method.locality(self.shape, base, traits, tail)
-        # Nothing in a plan says that shading does not depend on the place, unless it says that there is none.
-        if self.shape.is_glossy and method.simulated_aperture is None and base.summary.get("eyes", 1):
-            self.locality = None
         # The device computes CoC from float32 numbers.
         largest = max(abs(w) for w in frame.inverse_depth_range)
         self.slack_px = 4e-7 * (abs(self.c1) * largest + abs(self.c0))
@@ -589,10 +584,10 @@ class _Planner:
 
     def _may_cut(self, windows: tuple[Window, ...]) -> bool:
         """Whether nothing has to be guessed near the windows."""
-        limit = self.locality.guesses_nearer_than_px if self.locality is not None else -math.inf
-        if limit == -math.inf:
+        assert self.locality is not None
+        if self.locality.guesses_nearer_than_px == -math.inf:
             return True
-        shape, edge = self.shape, self.locality.guesses_at_edges_px if self.locality is not None else 0.0
+        shape, edge = self.shape, self.locality.guesses_at_edges_px
         for window in windows:
             x0, y0, x1, y1 = window.inner
             x0, y0 = max(x0, shape.guard_px), max(y0, shape.guard_px)
@@ -600,10 +595,16 @@ class _Planner:
             if min(x0, y0, shape.width - x1, shape.height - y1) < edge:
                 return False
         # An opaque slot that is far enough is not culled, and then there is nothing to guess.
-        return all(bool(self._known(limit)[_tiles_of(window)].all()) for window in windows)
+        return self._is_known(windows)
 
-    def _known(self, limit: float) -> NDArray[np.bool_]:
-        """Tiles in which every pixel has something opaque with a CoC of at least ``limit``, (ty, tx)."""
+    def _is_known(self, windows: tuple[Window, ...]) -> bool:
+        return all(bool(self._known[_tiles_of(window)].all()) for window in windows)
+
+    @cached_property
+    def _known(self) -> NDArray[np.bool_]:
+        """Tiles in which every pixel has something opaque that the method never culls, (ty, tx)."""
+        assert self.locality is not None
+        limit = self.locality.guesses_nearer_than_px
         nearest = self.frame.farthest_opaque
         for axis in (0, 1):
             nearest = np.maximum.reduceat(nearest, range(0, nearest.shape[axis], TILE), axis=axis)
@@ -757,9 +758,8 @@ class _Planner:
             yield Decision("empty depth layers", True, reason)
 
     def _disocclusion(self, windows: tuple[Window, ...] | None) -> Decision:
-        limit = self.locality.guesses_nearer_than_px if self.locality is not None else math.inf
         reason = "what is taken away is filled from the peel behind it, and where there is none from around it"
-        if windows is not None and all(bool(self._known(limit)[_tiles_of(window)].all()) for window in windows):
+        if windows is not None and self._is_known(windows):
             reason = "a peel stands behind all that is taken away; only what lies beyond the edges is guessed"
         return Decision("disocclusion", True, reason)
 
@@ -991,10 +991,16 @@ def bin_scale(frame: LayeredFrame) -> tuple[float, float]:
     return first, BINS / (last - first) if last > first else 0.0
 
 
+def stats_params(frame: LayeredFrame) -> dict[str, np.float32]:
+    """Parameters of :func:`stats_passes` for a frame."""
+    first, scale = bin_scale(frame)
+    return {"first_bin": np.float32(first), "bin_scale": np.float32(scale)}
+
+
 def stats_passes(shape: FrameShape, is_cpu: bool) -> tuple[list[Buffer], list[Pass]]:
     """Passes that read ``color`` and ``inv_depth`` and write the outputs ``tiles`` and ``histogram``.
 
-    Their parameters are ``first_bin`` and ``bin_scale``, as of :func:`bin_scale`.
+    Their parameters are those of :func:`stats_params`.
     """
     tiles_x, tiles_y = -(-shape.width // TILE), -(-shape.height // TILE)
     size = struct_scalar(_SIZE, shape.width, shape.height, shape.pitch, shape.layers, tiles_x, tiles_y)

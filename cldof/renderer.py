@@ -27,6 +27,7 @@ from .host.profile import PassTiming, copy_baseline, pass_timings
 from .host.scheduler import Batch, FrameRing, Submission, compile
 from .lens import Lens
 from .methods import FrameShape, Method, make_method
+from .methods.base import EMPTY
 from .planner import (
     MAX_CHANGE,
     FramePlan,
@@ -37,6 +38,7 @@ from .planner import (
     plan_frame,
     planned_program,
     read_stats,
+    stats_params,
     stats_passes,
 )
 
@@ -49,8 +51,6 @@ _MAX_SUPERSAMPLE = 8
 _KEPT_PLANS = 16
 # Pixels an item of frame_box makes, as kernels/frame.cl has it.
 _BOX_RUN = 16
-# Inverse depth of a slot with nothing in it, as kernels/common.clh has it.
-_EMPTY = -1.0
 
 
 @dataclass(frozen=True)
@@ -520,14 +520,14 @@ class Renderer:
             return held
         preparation = self._free_preparation(shape)
         if preparation is None:
-            make = _preparation_program if self._planned else _inverse_depth_program
-            preparation = compile(make(shape, self.device.traits.is_cpu), self.device)
+            is_cpu = self.device.traits.is_cpu
+            program = _preparation_program(shape, is_cpu) if self._planned else _inverse_depth_program(shape)
+            preparation = compile(program, self.device)
         pool = self.device.pool
         color, depth = pool.to_device(frame.color, "upload color"), pool.to_device(frame.depth, "upload depth")
-        first, scale = bin_scale(frame)
         submission = preparation.submit(
             {"color": color.buffer, "depth": depth.buffer},
-            {"first_bin": np.float32(first), "bin_scale": np.float32(scale)} if self._planned else {},
+            stats_params(frame) if self._planned else {},
             [*color.waits, *depth.waits],
         )
         pool.free_input(depth, submission.event)
@@ -597,13 +597,12 @@ def _auto(options: dict[str, Any]) -> Auto:
 def frame_stats(device: Device, frame: LayeredFrame) -> SceneStats:
     """Statistics of one frame, on a device of the caller's; a :class:`Renderer` has them for its own frames."""
     shape = FrameShape.of(frame)
-    first, scale = bin_scale(frame)
     pool = device.pool
     inputs = {"color": pool.to_device(frame.color), "depth": pool.to_device(frame.depth)}
     with compile(_preparation_program(shape, device.traits.is_cpu), device) as batch:
         submission = batch.submit(
             {name: one.buffer for name, one in inputs.items()},
-            {"first_bin": np.float32(first), "bin_scale": np.float32(scale)},
+            stats_params(frame),
             [event for one in inputs.values() for event in one.waits],
         )
         stats = _ComingStats(frame, shape, batch, pool, submission.event).wait()
@@ -619,11 +618,11 @@ def _preparation_program(shape: FrameShape, is_cpu: bool) -> FrameProgram:
     return FrameProgram.of([*program.buffers.values(), *buffers], [*program.passes, *passes])
 
 
-def _inverse_depth_program(shape: FrameShape, is_cpu: bool = True) -> FrameProgram:
+def _inverse_depth_program(shape: FrameShape) -> FrameProgram:
     slots = shape.layers * shape.height * shape.width
     rows = shape.layers * shape.height
     # Where the image is not opaque, nothing there is a surface at infinity without colour or alpha.
-    nothing = np.float32(_EMPTY if shape.is_opaque else 0.0)
+    nothing = np.float32(EMPTY if shape.is_opaque else 0.0)
     return FrameProgram.of(
         [
             Buffer("color", slots * 16, Role.INPUT),

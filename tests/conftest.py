@@ -7,14 +7,12 @@ writes outside its buffers, or counts on zeros, fails here without any effort in
 
 from __future__ import annotations
 
-import atexit
 import os
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import hypothesis
 import numpy as np
@@ -24,6 +22,7 @@ from cldof.errors import DeviceError
 from cldof.host import opencl as cl
 from cldof.host.buffers import BufferPool
 from cldof.host.device import Device, DeviceInfo, Traits, list_devices
+from cldof.host.quirks import prepare_environment, user_cache_dir
 
 hypothesis.settings.register_profile("cldof", deadline=None, derandomize="CI" in os.environ)
 hypothesis.settings.load_profile("cldof")
@@ -32,40 +31,10 @@ CANARY = 0xA5
 UNWRITTEN = 0xFF  # NaN as float32, -1 as int32
 
 
-def _claim_pocl_cache() -> IO[str] | None:
-    """Point PoCL to a cache directory that no other running process uses, and that later runs find again.
-
-    PoCL's cache may crash when processes share it. Directories are numbered; a lock that ends with this process marks
-    the ones in use.
-    """
-    try:
-        import fcntl
-    except ImportError:  # not a POSIX system
-        os.environ["POCL_CACHE_DIR"] = tempfile.mkdtemp(prefix="cldof-pocl-")
-        return None
-    root = Path(os.environ.get("POCL_CACHE_DIR") or Path.home() / ".cache" / "cldof-tests")
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        for number in range(256):
-            lock = open(root / f"pocl-{number}.lock", "w")  # noqa: SIM115 - held until the process ends
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                lock.close()
-                continue
-            (root / f"pocl-{number}").mkdir(exist_ok=True)
-            os.environ["POCL_CACHE_DIR"] = str(root / f"pocl-{number}")
-            return lock
-    except OSError:  # a read-only home directory
-        pass
-    os.environ["POCL_CACHE_DIR"] = tempfile.mkdtemp(prefix="cldof-pocl-")
-    return None
-
-
-# Before anything imports pyopencl. The variables also reach subprocesses.
-_pocl_cache_lock = _claim_pocl_cache()
-if _pocl_cache_lock is not None:
-    atexit.register(_pocl_cache_lock.close)
+# Before anything imports pyopencl: a cache that later runs find again, where each process at a time has a directory of
+# its own. The variables also reach subprocesses.
+os.environ["POCL_CACHE_DIR"] = os.environ.get("POCL_CACHE_DIR") or str(user_cache_dir() / "cldof-tests")
+prepare_environment()
 os.environ["CLDOF_CACHE_DIR"] = str(Path(os.environ["POCL_CACHE_DIR"]) / "cldof")
 
 

@@ -15,9 +15,12 @@ from ..host.device import Traits
 from ..host.passes import FrameProgram
 from ..lens import Lens
 
-__all__ = ["FrameShape", "Locality", "Method", "Plan", "row_pitch", "struct_scalar"]
+__all__ = ["EMPTY", "FrameShape", "Locality", "Method", "Plan", "row_pitch", "struct_scalar"]
 
 Array = NDArray[np.float64]
+
+EMPTY = -1.0
+"""Inverse depth of a slot with nothing in it, as kernels/common.clh has it."""
 
 
 class FrameShape(NamedTuple):

@@ -1,43 +1,14 @@
 """What a plan leaves out changes no pixel by more than the plan says, and by no more than one step of 255."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cldof import LayeredFrame, Lens, Renderer
-from cldof.host.device import DeviceInfo
-from cldof.methods import METHODS
-from cldof.planner import MAX_CHANGE, FramePlan
+from cldof import LayeredFrame, Lens
 from tests.frames import noise_frame
+from tests.planner.pairs import Pair, check
 from tests.planner.scenes import Box, lens_for, wall_frame
-
-# Means of equal numbers differ by rounding; windows of recursive filters begin elsewhere.
-ROUNDING = 4e-6
-
-Pair = tuple[Renderer, Renderer]
-
-
-@pytest.fixture(scope="module", params=sorted(METHODS))
-def pair(request: pytest.FixtureRequest, device_info: DeviceInfo) -> Iterator[Pair]:
-    with (
-        Renderer(request.param, device=device_info.index) as planned,
-        Renderer(request.param, device=device_info.index, planned=False) as full,
-    ):
-        yield planned, full
-
-
-def check(pair: Pair, frame: LayeredFrame, lens: Lens) -> FramePlan:
-    planned, full = (renderer.render(frame, lens) for renderer in pair)
-    plan = planned.plan
-    brightest = max(1.0, float(frame.color.max()))
-    change = float(np.abs(planned.image - full.image).max())
-    assert change <= plan.error_bound + ROUNDING * brightest, plan.explain()
-    assert plan.error_bound <= MAX_CHANGE, plan.explain()
-    return plan
-
 
 WINDOW_CASES: dict[str, tuple[list[Box], float, int]] = {
     "near box": ([(100, 90, 150, 130, 1.0)], 4.0, 1),

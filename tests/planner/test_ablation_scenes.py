@@ -1,28 +1,16 @@
 """Plans of every built-in scene, by every method, against everything switched on."""
 
-from collections.abc import Iterator
 from functools import cache
 
 import numpy as np
 import pytest
 
-from cldof import LayeredFrame, Lens, Renderer
+from cldof import LayeredFrame, Lens
 from cldof.capture.scenes import builtin_scene, builtin_scenes
-from cldof.host.device import DeviceInfo
-from cldof.methods import METHODS
 from tests.opengl import require_opengl
-from tests.planner.test_ablation import Pair, check
+from tests.planner.pairs import Pair, check
 
 SIZE = 80
-
-
-@pytest.fixture(scope="module", params=sorted(METHODS))
-def pair(request: pytest.FixtureRequest, device_info: DeviceInfo) -> Iterator[Pair]:
-    with (
-        Renderer(request.param, device=device_info.index) as planned,
-        Renderer(request.param, device=device_info.index, planned=False) as full,
-    ):
-        yield planned, full
 
 
 @cache
