@@ -1,7 +1,7 @@
 """`python -m bench`: what `cldof bench` does, from a checkout.
 
 `python -m bench speed` times passes and blurs, `python -m bench auto` judges ``method="auto"``, `python -m bench
-planned` tells what planning is worth.
+planned` tells what planning is worth, `python -m bench racks` whether focus may move.
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ import argparse
 import sys
 
 from cldof.benchmark.command import add_arguments, bench
+from cldof.capture.scenes import builtin_scenes
 from cldof.errors import CldofError
+from cldof.methods import METHODS
 
-from . import auto, planned, speed
+from . import auto, planned, racks, speed
 
 
 def main() -> int:
@@ -45,6 +47,18 @@ def main() -> int:
             parser.add_argument("--output", metavar="FILE", help="keep the numbers as JSON")
             arguments = parser.parse_args(sys.argv[2:])
             planned.report(arguments.device, arguments.size, arguments.runs, arguments.output)
+            return 0
+        if sys.argv[1:2] == ["racks"]:
+            parser = argparse.ArgumentParser(prog="bench racks", description="Does a rack of focus jump?")
+            parser.add_argument("--device", help="index, cpu, gpu or part of a name (as cldof render --device)")
+            parser.add_argument("--scenes", nargs="+", default=list(builtin_scenes()), help="of the built-in ones")
+            parser.add_argument("--methods", nargs="+", default=sorted(METHODS), help="all by default")
+            parser.add_argument("--frames", type=int, default=120, help="of a rack (default 120)")
+            parser.add_argument("--size", type=int, default=96, help="pixels a side (default 96)")
+            parser.add_argument("--views", type=int, default=48, help="of a reference (default 48)")
+            parser.add_argument("--output", metavar="FILE", help="keep the numbers as JSON")
+            arguments = parser.parse_args(sys.argv[2:])
+            racks.report(**vars(arguments))
             return 0
         parser = argparse.ArgumentParser(prog="bench", description=__doc__)
         add_arguments(parser)
