@@ -998,13 +998,13 @@ def stats_params(frame: LayeredFrame) -> dict[str, np.float32]:
 
 
 def stats_passes(shape: FrameShape, is_cpu: bool) -> tuple[list[Buffer], list[Pass]]:
-    """Passes that read ``color`` and ``inv_depth`` and write the outputs ``tiles`` and ``histogram``.
+    """Passes that read ``color`` and ``depth`` and write the outputs ``inv_depth``, ``tiles`` and ``histogram``.
 
     Their parameters are those of :func:`stats_params`.
     """
     tiles_x, tiles_y = -(-shape.width // TILE), -(-shape.height // TILE)
     size = struct_scalar(_SIZE, shape.width, shape.height, shape.pitch, shape.layers, tiles_x, tiles_y)
-    args = (read("inv_depth"), read("color"), size, Param("first_bin", _FLOAT), Param("bin_scale", _FLOAT))
+    bins = (Param("first_bin", _FLOAT), Param("bin_scale", _FLOAT))
     slots = shape.layers * shape.height * shape.width
     tile_bytes = shape.layers * tiles_y * tiles_x * _TILE_STATS.itemsize
     bin_bytes = shape.layers * tiles_y * BINS * 4
@@ -1013,15 +1013,15 @@ def stats_passes(shape: FrameShape, is_cpu: bool) -> tuple[list[Buffer], list[Pa
         Pass(
             "stats",
             "stats_tiles",
-            (write("tiles"), *args),
+            (write("inv_depth"), write("tiles"), read("depth"), read("color"), size, shape.nothing, *bins),
             (tiles_x, tiles_y, shape.layers),
             (1, 1, 1) if is_cpu else None,
-            traffic_bytes=slots * 20 + tile_bytes,
+            traffic_bytes=slots * 24 + tile_bytes,
         ),
         Pass(
             "stats",
             "stats_histogram",
-            (write("histogram"), *args),
+            (write("histogram"), read("inv_depth"), read("color"), size, *bins),
             (tiles_y, shape.layers),
             (1, 1) if is_cpu else None,
             traffic_bytes=slots * 20 // TILE + bin_bytes,

@@ -27,7 +27,6 @@ from .host.profile import PassTiming, copy_baseline, pass_timings
 from .host.scheduler import Batch, FrameRing, Submission, compile
 from .lens import Lens
 from .methods import FrameShape, Method, make_method
-from .methods.base import EMPTY
 from .planner import (
     MAX_CHANGE,
     FramePlan,
@@ -520,8 +519,7 @@ class Renderer:
             return held
         preparation = self._free_preparation(shape)
         if preparation is None:
-            is_cpu = self.device.traits.is_cpu
-            program = _preparation_program(shape, is_cpu) if self._planned else _inverse_depth_program(shape)
+            program = _preparation_program(shape, self.device.traits.is_cpu, self._planned)
             preparation = compile(program, self.device)
         pool = self.device.pool
         color, depth = pool.to_device(frame.color, "upload color"), pool.to_device(frame.depth, "upload depth")
@@ -599,7 +597,7 @@ def frame_stats(device: Device, frame: LayeredFrame) -> SceneStats:
     shape = FrameShape.of(frame)
     pool = device.pool
     inputs = {"color": pool.to_device(frame.color), "depth": pool.to_device(frame.depth)}
-    with compile(_preparation_program(shape, device.traits.is_cpu), device) as batch:
+    with compile(_preparation_program(shape, device.traits.is_cpu, with_stats=True), device) as batch:
         submission = batch.submit(
             {name: one.buffer for name, one in inputs.items()},
             stats_params(frame),
@@ -611,41 +609,33 @@ def frame_stats(device: Device, frame: LayeredFrame) -> SceneStats:
     return stats
 
 
-def _preparation_program(shape: FrameShape, is_cpu: bool) -> FrameProgram:
-    """What is made of a frame once: inverse depth, and statistics for the planner."""
-    program = _inverse_depth_program(shape)
-    buffers, passes = stats_passes(shape, is_cpu)
-    return FrameProgram.of([*program.buffers.values(), *buffers], [*program.passes, *passes])
-
-
-def _inverse_depth_program(shape: FrameShape) -> FrameProgram:
+def _preparation_program(shape: FrameShape, is_cpu: bool, with_stats: bool) -> FrameProgram:
+    """What is made of a frame once: inverse depth, and on the way statistics for the planner."""
     slots = shape.layers * shape.height * shape.width
     rows = shape.layers * shape.height
-    # Where the image is not opaque, nothing there is a surface at infinity without colour or alpha.
-    nothing = np.float32(EMPTY if shape.is_opaque else 0.0)
-    return FrameProgram.of(
-        [
-            Buffer("color", slots * 16, Role.INPUT),
-            Buffer("depth", slots * 4, Role.INPUT),
-            Buffer("inv_depth", rows * shape.pitch * 4, Role.OUTPUT),
-        ],
-        [
-            Pass(
-                "frame",
-                "frame_inverse_depth",
-                (
-                    write("inv_depth"),
-                    read("depth"),
-                    read("color"),
-                    np.int32(shape.width),
-                    np.int32(shape.pitch),
-                    nothing,
-                ),
-                (rows,),
-                traffic_bytes=slots * 8,
-            )
-        ],
+    buffers = [
+        Buffer("color", slots * 16, Role.INPUT),
+        Buffer("depth", slots * 4, Role.INPUT),
+        Buffer("inv_depth", rows * shape.pitch * 4, Role.OUTPUT),
+    ]
+    if with_stats:
+        more, passes = stats_passes(shape, is_cpu)
+        return FrameProgram.of([*buffers, *more], passes)
+    inverse = Pass(
+        "frame",
+        "frame_inverse_depth",
+        (
+            write("inv_depth"),
+            read("depth"),
+            read("color"),
+            np.int32(shape.width),
+            np.int32(shape.pitch),
+            shape.nothing,
+        ),
+        (rows,),
+        traffic_bytes=slots * 24,
     )
+    return FrameProgram.of(buffers, [inverse])
 
 
 def _resolved(program: FrameProgram, size: tuple[int, int], factor: int) -> FrameProgram:

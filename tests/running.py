@@ -9,7 +9,8 @@ from cldof.host.device import Device
 from cldof.host.passes import Access, Buffer, FrameProgram, Mode, Pass, Role, read, write
 from cldof.host.scheduler import compile
 from cldof.methods import FrameShape, Method
-from cldof.renderer import _inverse_depth_program
+from cldof.planner import stats_params
+from cldof.renderer import _preparation_program
 
 __all__ = ["inverse_depth", "padded", "render_frame", "run_pass", "run_program"]
 
@@ -70,12 +71,14 @@ def padded(image: np.ndarray, pitch: int, fill: float = np.nan) -> np.ndarray:
     return result
 
 
-def inverse_depth(device: Device, frame: LayeredFrame) -> np.ndarray:
+def inverse_depth(device: Device, frame: LayeredFrame, with_stats: bool = False) -> np.ndarray:
     """What the renderer derives from a frame once; (layers, height, pitch)."""
     shape = FrameShape.of(frame)
+    program = _preparation_program(shape, device.traits.is_cpu, with_stats)
     inputs = {"color": frame.color, "depth": frame.depth}
+    params = dict(stats_params(frame)) if with_stats else {}
     size = (shape.layers, shape.height, shape.pitch)
-    return run_program(device, _inverse_depth_program(shape), inputs, {}, "inv_depth", size)
+    return run_program(device, program, inputs, params, "inv_depth", size)
 
 
 def render_frame(device: Device, method: Method, frame: LayeredFrame, lens: Lens) -> np.ndarray:

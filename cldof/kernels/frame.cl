@@ -1,8 +1,8 @@
 /* frame.cl: what every method derives from a frame's layers once, before any lens is known. */
 
-#include "common.clh"
+#include "frame.clh"
 
-/* frame_inverse_depth: 1/z of every slot, in rows padded to a pitch.
+/* frame_inverse_depth: 1/z of every slot, in rows padded to a pitch; stats_tiles does the same on its way.
  * source  DESIGN section 2: the CoC is linear in inverse depth, and 0 stands for infinity without being an inf
  * reads   depth  float[peels][height][width]      m, inf = sky or nothing there
  *         color  float[peels][height][width][4]   tells what is there from what is not
@@ -14,15 +14,8 @@ __kernel void frame_inverse_depth(__global float *restrict inv_depth, const __gl
     const size_t row = get_global_id(0);
     const __global float *z = depth + row * width;
     const __global float *rgba = color + row * width * 4;
-    __global float *w = inv_depth + row * pitch;
-    for (int x = 0; x < width; x++) {
-        float inverse = 1.0f / z[x]; /* 0 for inf */
-        float there = inverse;
-        if (nothing < 0.0f) /* a slot without light or coverage hides nothing, whatever its depth */
-            there = rgba[4 * x] + rgba[4 * x + 1] + rgba[4 * x + 2] + rgba[4 * x + 3];
-        w[x] = there > 0.0f || rgba[4 * x + 3] > 0.0f ? inverse : nothing;
-    }
-    for (int x = width; x < pitch; x++) w[x] = EMPTY;
+    for (int x = 0; x < pitch; x += FRAME_RUN)
+        store_quad(inv_depth + row * pitch + x, inverse_run(z + x, rgba + 4 * x, width - x, nothing));
 }
 
 /* frame_box: mean of blocks of pixels, the resolve of a supersampled image.

@@ -1,9 +1,10 @@
-/* stats.cl: what a planner wants to know of a frame, per tile of STATS_TILE x STATS_TILE pixels and peel.
+/* stats.cl: what a planner wants to know of a frame, per tile of STATS_TILE x STATS_TILE pixels and peel, and the inverse
+ * depths that methods read: both need all of the colours, and reading those is what takes the time.
  *
  * All of it is in inverse depth, in which the CoC of any lens is linear: computed once per frame, good for all lenses.
  * A slot counts as there when it has an inverse depth and alpha, so the void of a frame that is not opaque does not. */
 
-#include "common.clh"
+#include "frame.clh"
 
 #define STATS_TILE 16
 /* Bins of inverse depth; a tile has a bit for each. */
@@ -67,14 +68,16 @@ static inline uint16 stats_bin(float16 w, float first, float scale)
     return convert_uint16(bin);
 }
 
-/* stats_tiles: ranges of depth and colour of each tile of each peel.
- * reads   inv_depth  float[peels][height][pitch]     1/m
+/* stats_tiles: inverse depth of every slot, and ranges of depth and colour of each tile of each peel.
+ * reads   depth      float[peels][height][width]      m, inf = sky or nothing there
  *         color      float[peels][height][width][4]
- * writes  tiles      StatsTile[peels][tiles_y][tiles_x]
+ * writes  inv_depth  float[peels][height][pitch]      as frame_inverse_depth
+ *         tiles      StatsTile[peels][tiles_y][tiles_x]
  * scalars first, scale  bin of w is (w - first) * scale, clamped
  * range   3-D, one item per tile and peel, any local size */
-__kernel void stats_tiles(__global StatsTile *restrict tiles, const __global float *restrict inv_depth,
-                          const __global float *restrict color, StatsSize size, float first, float scale)
+__kernel void stats_tiles(__global float *restrict inv_depth, __global StatsTile *restrict tiles,
+                          const __global float *restrict depth, const __global float *restrict color, StatsSize size,
+                          float nothing, float first, float scale)
 {
     const int tx = get_global_id(0), ty = get_global_id(1), m = get_global_id(2);
     if (tx >= size.tiles_x || ty >= size.tiles_y || m >= size.peels) return;
@@ -82,22 +85,35 @@ __kernel void stats_tiles(__global StatsTile *restrict tiles, const __global flo
     const int y0 = STATS_TILE * ty;
     const int rows = size.height - y0 < STATS_TILE ? size.height - y0 : STATS_TILE;
     const float16 none = (float16)(MAXFLOAT), zero = (float16)(0.0f), one = (float16)(1.0f);
-    const __global float *inv = inv_depth + ((size_t)m * size.height + y0) * size.pitch + x;
-    const __global float *rgba = color + (((size_t)m * size.height + y0) * size.width + x) * 4;
+    const size_t first_row = (size_t)m * size.height + y0;
+    __global float *inv = inv_depth + first_row * size.pitch + x;
+    const __global float *z = depth + first_row * size.width + x;
+    const __global float *rgba = color + (first_row * size.width + x) * 4;
     const size_t color_row = (size_t)size.width * 4;
 
     /* Depth alone first: most tiles turn out to be full or empty, and need no masks. */
-    float16 nearest = (float16)(EMPTY), farthest = none, step = zero;
+    float16 nearest = (float16)(EMPTY), farthest = none, step = zero, above = nearest;
     for (int i = 0; i < rows; i++) {
-        const __global float *at = inv + (size_t)i * size.pitch;
-        const float16 w = load_quad(at);
-        const float16 right = x + STATS_TILE < size.pitch ? load_quad(at + 1)
-                                                          : (float16)(w.s12345678, w.s9abc, w.sde, w.sf, EMPTY);
-        const float16 below = load_quad(at + (y0 + i + 1 < size.height ? size.pitch : 0));
+        const __global float *from = rgba + i * color_row, *at = z + (size_t)i * size.width;
+        const float16 w = inverse_run(at, from, n, nothing);
+        const float next = n > STATS_TILE
+                               ? inverse_of(at[STATS_TILE], load_pixel(from + 4 * STATS_TILE), nothing)
+                               : EMPTY;
+        const float16 right = (float16)(w.s12345678, w.s9abc, w.sde, w.sf, next);
+        store_quad(inv + (size_t)i * size.pitch, w);
         nearest = greater(nearest, w);
         farthest = lesser(farthest, w);
-        step = greater(step, greater(stats_step(w, right), stats_step(w, below)));
+        step = greater(step, greater(stats_step(w, right), stats_step(w, above)));
+        above = w;
     }
+    if (y0 + rows < size.height) {
+        const float16 below = inverse_run(z + (size_t)rows * size.width, rgba + rows * color_row, n, nothing);
+        step = greater(step, stats_step(above, below));
+    }
+    if (tx == size.tiles_x - 1)
+        for (int i = 0; i < rows; i++)
+            for (int past = STATS_TILE; x + past < size.pitch; past += STATS_TILE)
+                store_quad(inv + (size_t)i * size.pitch + past, (float16)(EMPTY));
     StatsTile tile;
     tile.nearest = max16(nearest);
     tile.farthest = MAXFLOAT;

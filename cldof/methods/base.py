@@ -55,6 +55,11 @@ class FrameShape(NamedTuple):
         return row_pitch(self.width)
 
     @property
+    def nothing(self) -> np.float32:
+        """Inverse depth of slots with neither light nor coverage: where the image is not opaque, the void's."""
+        return np.float32(EMPTY if self.is_opaque else 0.0)
+
+    @property
     def output_size(self) -> tuple[int, int]:
         """(height, width) without the guard band."""
         return self.height - 2 * self.guard_px, self.width - 2 * self.guard_px

@@ -42,6 +42,7 @@ class Mutant:
 SUITES: dict[str, list[list[str]]] = {
     "blur.cl": [["tests/kernels/test_blur.py", "-k", "not full_hd and not 200 and not 120"]],
     "frame.cl": [["tests/kernels/test_frame.py", "tests/test_renderer.py", "-k", "inverse or supersampling"]],
+    "frame.clh": [["tests/kernels/test_frame.py", "tests/planner/test_stats.py"]],
     "gather.cl": [["tests/kernels/test_gather.py", "tests/methods/test_gather.py"]],
     "layered.cl": [["tests/methods/test_layered.py"]],
     "lightfield.cl": [["tests/kernels/test_lightfield.py"], ["tests/methods/test_lightfield.py"]],
@@ -102,10 +103,18 @@ MUTANTS: list[Mutant] = [
     ),
     *_rows(
         "frame.cl",
-        ("compare", "w[x] = there > 0.0f || rgba[4 * x + 3] > 0.0f", "w[x] = there > 0.0f || rgba[4 * x + 3] >= 0.0f"),
-        ("drop", "for (int x = width; x < pitch; x++) w[x] = EMPTY;", ""),
+        ("off by one", "inverse_run(z + x, rgba + 4 * x, width - x, nothing)",
+         "inverse_run(z + x, rgba + 4 * x, width - x + 1, nothing)"),
         ("weight", "1.0f / (float)(factor * factor)", "1.0f / (float)(factor)"),
         ("off by one", "for (int i = 0; i < factor; i++) sum", "for (int i = 1; i < factor; i++) sum"),
+    ),
+    *_rows(
+        "frame.clh",
+        ("compare", "return there > 0.0f || rgba.w > 0.0f", "return there > 0.0f || rgba.w >= 0.0f"),
+        ("compare", "return there > 0.0f || alpha > 0.0f", "return there > 0.0f || alpha >= 0.0f"),
+        ("drop", "there = (float16)(p.s048c, q.s048c, r.s048c, s.s048c) + (float16)(p.s159d, q.s159d, r.s159d, s.s159d) +",
+         "there = (float16)(p.s048c, q.s048c, r.s048c, s.s048c) +"),
+        ("clamp", "load_pixel(color + 4 * i), nothing) : EMPTY;", "load_pixel(color + 4 * i), nothing) : nothing;"),
     ),
     *_rows(
         "gather.cl",

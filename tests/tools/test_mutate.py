@@ -22,18 +22,18 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
 @pytest.mark.parametrize(
     ("new", "verdict"),
     [
-        ("float inverse = 2.0f / z[x];", "caught"),
-        ("float inverse = 1.0f / (z[x]);", "survived"),
-        ("float inverse = 1.0f / nothing_of_that_name;", "broken"),
+        ("w = 2.0f / load_quad(depth);", "caught"),
+        ("w = 1.0f / (load_quad(depth));", "survived"),
+        ("w = 1.0f / nothing_of_that_name;", "broken"),
     ],
 )
 def test_a_mutant_meets_its_fate(workshop: Workshop, device_info: object, new: str, verdict: str) -> None:
-    mutant = Mutant("frame.cl", "float inverse = 1.0f / z[x];", new, "weight")
-    before = (workshop.tree / "cldof" / "kernels" / "frame.cl").read_text()
+    mutant = Mutant("frame.clh", "w = 1.0f / load_quad(depth);", new, "weight")
+    before = (workshop.tree / "cldof" / "kernels" / "frame.clh").read_text()
     outcome = workshop.try_out(mutant, SUITE, 300.0)
     assert outcome.verdict == verdict, outcome.by
     assert ("test_inverse_depth" in outcome.by) == (verdict == "caught")
-    assert (workshop.tree / "cldof" / "kernels" / "frame.cl").read_text() == before
+    assert (workshop.tree / "cldof" / "kernels" / "frame.clh").read_text() == before
     assert workshop.tree.resolve() != Path(ROOT).resolve()
 
 
