@@ -150,12 +150,6 @@ class SceneStats:
         return float(self.high.max())
 
     @cached_property
-    def highlight(self) -> Array:
-        """Largest channel of a tile's first peel over its mean luminance, (ty, tx): what would show as a bokeh."""
-        peak = self.high[0, ..., :3].max(axis=-1)
-        return np.asarray(peak / np.maximum(self.luminance[0], 1e-6), np.float32)
-
-    @cached_property
     def occupied(self) -> NDArray[np.bool_]:
         """Bins that hold anything, (64,)."""
         bits = int(np.bitwise_or.reduce(self.bins, axis=None))
@@ -193,6 +187,19 @@ class SceneStats:
         total = max(float(count.sum()), 1.0)
         near, far = float(count[coc < -still_px].sum()), float(count[coc > still_px].sum())
         return near / total, 1.0 - (near + far) / total, far / total
+
+    def highlights(self, lens: Lens, camera: Camera) -> NDArray[np.float64]:
+        """Radiance times area of the CoC in px^2, the most of each peel and tile, (M, ty, tx): what shows as discs."""
+        coc = self.largest_coc(*lens.coc_coefficients(camera))
+        return np.asarray(self.high[..., :3].max(axis=-1) * math.pi * coc**2)
+
+    def largest_coc(self, c1: float, c0: float) -> NDArray[np.float64]:
+        """Largest CoC radius in px in each peel and tile, (M, ty, tx), 0 where nothing is; CoC = c1 / z + c0."""
+        there = self.slots > 0.0
+        nearest, farthest = (
+            np.abs(c1 * np.where(there, w, 0.0).astype(np.float64) + c0) for w in (self.nearest, self.farthest)
+        )
+        return np.where(there, np.maximum(nearest, farthest), 0.0)
 
     def summary(self) -> dict[str, Any]:
         """A few plain numbers for reports."""
@@ -701,6 +708,8 @@ class _Planner:
             total, step = says["layers"], says["sigma_step"]
             yield Decision("depth layers", True, f"{total} of at most 32, the blur growing by {step:.2g} px a layer")
             yield from self._empty_layers(total)
+            if self.locality is not None and self.locality.engines:
+                yield Decision("blur engines", True, self.locality.engines)
         if "first_sub_image" in says:
             first, last = says["first_sub_image"], says["last_sub_image"]
             yield Decision(
@@ -726,6 +735,10 @@ class _Planner:
         if "rays" in says:
             fewer = ", fewer where all that a cell of 16 x 16 px can see is little blurred" if says["adaptive"] else ""
             yield Decision("rays", True, f"up to {says['rays']} a pixel{fewer}")
+        if says.get("highlights"):
+            # Layers may be blurred more than what they hold.
+            least = says["highlight_coc_px"] - says["delta_px"]
+            yield self._highlights(says["highlight_above"], least, says["highlight_rays"])
         if "jitter" in says:
             reason = "asked for" if says["jitter"] else "thick rays leave no pattern to hide; jitter=True asks for it"
             yield Decision("jitter", bool(says["jitter"]), reason)
@@ -756,6 +769,21 @@ class _Planner:
         if empty:
             reason = f"{empty} of {total} hold nothing, but their blur steps belong to the layers beyond them"
             yield Decision("empty depth layers", True, reason)
+
+    def _highlights(self, above: float, coc_px: float, rays: int) -> Decision:
+        """Whether bright light is blurred enough to take more rays."""
+        stats = self.stats
+        light = stats.high[..., :3].max(axis=-1)
+        coc = stats.largest_coc(self.c1, self.c0)
+        shown = (light > above) & (coc >= coc_px)
+        if not shown.any():
+            return Decision("more rays for lights", False, f"no light above {above:g} is blurred by {coc_px:.2g} px")
+        share = float((shown.any(axis=0) * stats.pixels).sum() / stats.pixels.sum())
+        reason = (
+            f"light of up to {light[shown].max():.3g} in {share:.1%} of the tiles is blurred by up to "
+            f"{coc[shown].max():.1f} px: {rays} rays where it may be seen"
+        )
+        return Decision("more rays for lights", True, reason)
 
     def _disocclusion(self, windows: tuple[Window, ...] | None) -> Decision:
         reason = "what is taken away is filled from the peel behind it, and where there is none from around it"

@@ -131,6 +131,8 @@ class Locality:
         all around; such places are not taken apart. -inf: it never guesses.
     guesses_at_edges_px : float
         So near to the edges of the frame (not of the image) it guesses, too.
+    engines : str
+        Which blur engines run on this device, in words, where there is a choice.
     """
 
     align_px: int
@@ -144,6 +146,7 @@ class Locality:
     rim_px: int = 0
     guesses_nearer_than_px: float = -math.inf
     guesses_at_edges_px: float = 0.0
+    engines: str = ""
 
 
 class Method(Protocol):

@@ -231,15 +231,12 @@ class Layered:
         coc = np.abs(layer_coc(stack))
         sides = [coc[stack.front :: -1], coc[stack.front :]]
         longest = max(sides, key=len)
-        steps = tuple(stack.sigma_step * n for n in range(1, len(longest)))
-        if not self.cascade:
-            reaches = [
-                _reach(((GAUSSIAN_SIGMA * float(c), is_recursive(GAUSSIAN_SIGMA * float(c))),), tail)
-                for c in longest[1:]
-            ]
+        if self.cascade:
+            sigmas = [stack.sigma_step * n for n in range(1, len(longest))]
         else:
-            engines = tuple((sigma, is_recursive(sigma)) for sigma in steps)
-            reaches = [_reach(engines[: n + 1], tail) for n in range(len(engines))]
+            sigmas = [GAUSSIAN_SIGMA * float(c) for c in longest[1:]]
+        blurs = tuple((sigma, is_recursive(sigma)) for sigma in sigmas)
+        reaches = [_reach(blurs[0 if self.cascade else n : n + 1], tail) for n in range(len(blurs))]
         reach = np.array([0.0, *reaches])
         # To what is in front of a pixel, and from there to what shows where it lets light through, once.
         around = math.ceil(GAUSSIAN_SIGMA * float(longest[-1])) + 2
@@ -252,7 +249,7 @@ class Layered:
             share = 2.0 * coc_px / longest[1] if self.matting == "seamless" else np.ones_like(coc_px)
             return np.minimum(share, 1.0)
 
-        return Locality(_TILE, int(reach[-1]) + around, reach_px, leak, tail=tail)
+        return Locality(_TILE, int(reach[-1]) + around, reach_px, leak, tail=tail, engines=_in_words(blurs))
 
     def _stack(self, near_px: float, far_px: float) -> LayerStack:
         """The fewest layers that reach both ends of the CoC range, with the step enlarged until they are few enough."""
@@ -357,6 +354,16 @@ def _reach(blurs: tuple[tuple[float, bool], ...], tail: float) -> int:
     # Outside of +-r along one axis or the other.
     outside = 2.0 * (1.0 - np.cumsum(kernel[radius:] * np.where(np.arange(radius + 1) > 0, 2.0, 1.0)) / kernel.sum())
     return int(np.searchsorted(-outside, -tail))
+
+
+def _in_words(blurs: tuple[tuple[float, bool], ...]) -> str:
+    """Which of the blurs of the longer side are done how; (sigma, is recursive) by blur."""
+    parts = []
+    for recursive, name in ((False, "by taps (FIR)"), (True, "recursive (IIR)")):
+        sigmas = [sigma for sigma, is_recursive in blurs if is_recursive == recursive]
+        if sigmas:
+            parts.append(f"{len(sigmas)} {name}, sigma {min(sigmas):.2g} to {max(sigmas):.2g} px")
+    return "; ".join(parts)
 
 
 class _Taps:

@@ -75,8 +75,8 @@ _WINDOW_PX, _MATCHED_PX = 0.8, 4.0
 _CENTRED_PX = 0.8
 # Rays that move by less all stay in their pixel.
 _STILL_PX = 0.499
-# Bright light that is blurred by at least this much gets this many times the rays.
-_BRIGHT_PX, _BRIGHT_RAYS = 1.5, 4
+# Light above this (constant of kernels/multiview.cl) that is blurred by so many px gets so many times the rays.
+_BRIGHT, _BRIGHT_PX, _BRIGHT_RAYS = 1.5, 1.5, 4
 # Binary search in peels pays where layers grow by more than this: twice. Below, as many rays as take the same time gain
 # more.
 _COARSE_PX, _USUAL_HALVINGS = 2.0, 2
@@ -328,6 +328,9 @@ class Multiview:
             "largest_far_coc_px": far_px,
             "eyes": layers.eyes,
             "refine_steps": self.halvings(layers),
+            "highlight_rays": min(_BRIGHT_RAYS * self.rays, MAX_RAYS),
+            "highlight_above": _BRIGHT,
+            "highlight_coc_px": _BRIGHT_PX,
         }
         params = {"c1": np.float32(c1), "c0": np.float32(c0)}
         if layers.eyes:

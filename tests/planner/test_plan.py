@@ -93,9 +93,19 @@ def test_highlights(device_info: DeviceInfo) -> None:
     frame = LayeredFrame(color, frame.depth, frame.camera)
     with Renderer(device=device_info.index) as renderer:
         stats = renderer.stats(frame)
+    lens = lens_for(frame, 12.0, 3.0)
     assert stats.brightest == 100.0
-    assert np.unravel_index(stats.highlight.argmax(), stats.tiles) == (1, 2)
-    assert np.sort(stats.highlight, axis=None)[-2] == pytest.approx(1.0)
+    spread = stats.highlights(lens, frame.camera)
+    # The wall is at one depth, so all of it has the same CoC.
+    area = math.pi * float(lens.coc_radius_px(frame.camera, float(frame.depth[0, 0, 0]))) ** 2
+    assert area > 1.0
+    assert np.unravel_index(spread.argmax(), spread.shape) == (0, 1, 2)
+    assert np.sort(spread, axis=None)[-2:] == pytest.approx([0.5 * area, 100.0 * area], rel=1e-5)
+    with Renderer("multiview", device=device_info.index) as renderer:
+        lit, dim = (renderer.render(frame, lens_for(frame, coc, 3.0)).plan for coc in (12.0, 1.0))
+    assert decision(lit, "more rays for lights").kept
+    assert "100" in decision(lit, "more rays for lights").reason
+    assert not decision(dim, "more rays for lights").kept
 
 
 def test_a_smaller_change_allowed_is_kept(device_info: DeviceInfo) -> None:
