@@ -78,7 +78,7 @@ def test_timings_name_the_passes(device_info: DeviceInfo) -> None:
     with Renderer(device=device_info.index, profile=True) as renderer:
         result = renderer.render(frame, lens_for(frame))
     labels = [timing.label for timing in result.timings]
-    assert labels[0] == "layered_classify"
+    assert labels[0] == "layered_matting"
     assert labels[-1] == "layered_resolve"
     assert all(timing.ms >= 0.0 for timing in result.timings)
     assert result.wall_ms >= sum(timing.ms for timing in result.timings) * 0.5

@@ -34,7 +34,6 @@ class Effect(Enum):
 
     DRIVER_CACHES_BUILDS = "the driver keeps built programs on disk; ours would only be a second copy"
     NEEDS_LINKER = "needs the system linker for every build, and ends the whole process where there is none"
-    NO_ARRAY_ARGUMENTS = "ends the process in kernels that take a struct with an array and index it at run time"
     LAST_RESORT = "chosen only by name or index, or when there is nothing else"
 
 
@@ -97,14 +96,6 @@ QUIRKS = (
         effect=Effect.LAST_RESORT,
         reason="a conformance device: 17-170 ns per work-item, against 0.3-6 for the other CPU drivers",
         source="measured with Debian's mesa-opencl-icd",
-        date="2026-11-23",
-    ),
-    Quirk(
-        platform="rusticl",
-        device="llvmpipe",
-        effect=Effect.NO_ARRAY_ARGUMENTS,
-        reason="Mesa warns that it treats load_kernel_arg in control flow as uniform, then reads past its arguments",
-        source="seen with layered and pyramid; Debian's mesa-opencl-icd 22.3.6",
         date="2026-11-23",
     ),
     Quirk(

@@ -18,7 +18,6 @@ from . import opencl as cl
 from .device import Device
 from .launch import Launched, driver_errors, launch
 from .passes import Access, FrameProgram, Local, Mode, Param, Pass, Role
-from .quirks import Effect, effects_of
 
 __all__ = ["Batch", "FrameRing", "Submission", "compile"]
 
@@ -520,14 +519,3 @@ def _check_limits(step: Pass, device: Device) -> None:
             f"pass {step.label!r} wants work-groups of {prod(step.local_size)}; {device.info.name} runs up to "
             f"{device.traits.max_work_group_size}"
         )
-    if any(_has_array(argument.dtype) for argument in step.args if isinstance(argument, Param | np.generic)):
-        info = device.info
-        if Effect.NO_ARRAY_ARGUMENTS in effects_of(info.platform, info.name):
-            raise DeviceError(
-                f"pass {step.label!r} cannot run on {info.name}: its driver {Effect.NO_ARRAY_ARGUMENTS.value}. "
-                "Take another device, or a method that needs none, such as gather."
-            )
-
-
-def _has_array(dtype: np.dtype[Any]) -> bool:
-    return any(dtype[name].shape for name in dtype.names or ())

@@ -71,7 +71,7 @@ typedef struct {
     int segment;     /* pixels of a row a work-group owns, a multiple of LAYERED_TILE */
 } LayeredStep;
 
-static inline LayeredLayer layered_layer(const LayeredMatting *matting, int k)
+static inline LayeredLayer layered_layer(const __global LayeredMatting *matting, int k)
 {
     LayeredLayer layer = {matting->layer[k], k > 0 ? matting->layer[k - 1] : (float4)(0.0f), matting->reach[k],
                           matting->around[k]};
@@ -293,12 +293,19 @@ static inline int layered_is_reached(const __global int *reached, int below, int
     return any;
 }
 
+/* layered_matting: the frame's matting functions as a buffer. Mesa 22.3 ends the process in kernels that take a struct
+ * with an array by value and look an element up in it.
+ * writes  matting  LayeredMatting
+ * range   1-D, one item */
+__kernel void layered_matting(__global LayeredMatting *matting, LayeredMatting given) { *matting = given; }
+
 /* layered_classify: which peels bring something to which layer, per tile.
  * reads   inv_depth    float[peels][height][pitch]
+ *         matting      LayeredMatting
  * writes  tile_peels   uint[layers][tiles_y][tiles_x]  bit m: peel m has a slot with weight in the layer
  * range   2-D, one item per tile, any local size */
 __kernel void layered_classify(__global uint *restrict tile_peels, const __global float *restrict inv_depth,
-                               LayeredSize size, int layers, LayeredMatting matting)
+                               const __global LayeredMatting *restrict matting, LayeredSize size, int layers)
 {
     const int tx = get_global_id(0), ty = get_global_id(1);
     if (tx >= size.tiles_x || ty >= size.tiles_y) return;
@@ -319,7 +326,7 @@ __kernel void layered_classify(__global uint *restrict tile_peels, const __globa
                 farthest = w < farthest ? w : farthest;
             }
             for (int k = 0; k < layers; k++) {
-                float4 f = matting.layer[k]; /* `up` falls and `down` rises with w: the CoC falls as w grows */
+                float4 f = matting->layer[k]; /* `up` falls and `down` rises with w: the CoC falls as w grows */
                 hits[k] |= (farthest * f.x + f.y > 0.0f) & (nearest * f.z + f.w > 0.0f) & (nearest >= 0.0f);
             }
         }
@@ -341,6 +348,7 @@ __kernel void layered_classify(__global uint *restrict tile_peels, const __globa
  *         inv_depth   float[peels][height][pitch]
  *         tile_peels  uint[layers][tiles_y][tiles_x]
  *         taps        float[]                           all FIR taps, padded
+ *         matting     LayeredMatting
  * writes  out         float[height][pitch][4]
  *         reached_out int[tiles_y][tiles_x]
  * range   2-D groups: (segments of a row, blocks of FIR_ROWS rows); local size (any, 1)
@@ -350,8 +358,8 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
                            const __global float *restrict image, const __global int *restrict reached,
                            const __global float *restrict color, const __global float *restrict inv_depth,
                            const __global uint *restrict tile_peels, const __global float *restrict taps,
-                           LayeredSize size, LayeredStep step, LayeredMatting matting, __local float *restrict lines,
-                           __local int *restrict state)
+                           const __global LayeredMatting *restrict matting, LayeredSize size, LayeredStep step,
+                           __local float *restrict lines, __local int *restrict state)
 {
     const int lid = get_local_id(0), items = get_local_size(0);
     const int halo = (step.radius_out + 19) & ~15; /* blocks of 16 pixels stay aligned */
@@ -362,7 +370,7 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
     const int y0 = ty * FIR_ROWS;
     const int segment_tiles = step.segment / LAYERED_TILE;
     const int tile0 = x0 / LAYERED_TILE - halo_tiles; /* state[0] */
-    const LayeredLayer own = layered_layer(&matting, step.layer);
+    const LayeredLayer own = layered_layer(matting, step.layer);
     const __global uint *layer_peels = tile_peels + ((size_t)step.layer * size.tiles_y + ty) * size.tiles_x;
 
     /* What can be non-zero here, before touching any pixel. */
@@ -465,7 +473,7 @@ typedef struct {
 /* layered_resolve: front over the layer in focus over back, divided by coverage (eq. 12, section 3.3.1).
  * reads   front, back  float[height][pitch][4]  blurred along the rows, the column filter still owed
  *         front_reached, back_reached  int[tiles_y][tiles_x]
- *         color, inv_depth, tile_peels, taps  as layered_step
+ *         color, inv_depth, tile_peels, taps, matting  as layered_step
  * writes  out  float[height - 2*guard][width - 2*guard][4]
  * range   2-D groups: one per tile; local size (any, 1)
  * local   lines  float[FIR_ROWS][LAYERED_TILE][4] */
@@ -473,13 +481,13 @@ __kernel void layered_resolve(__global float *restrict out, const __global float
                               const __global int *restrict front_reached, const __global float *restrict back,
                               const __global int *restrict back_reached, const __global float *restrict color,
                               const __global float *restrict inv_depth, const __global uint *restrict tile_peels,
-                              const __global float *restrict taps, LayeredSize size, LayeredResolve resolve,
-                              LayeredMatting matting, __local float *restrict lines)
+                              const __global float *restrict taps, const __global LayeredMatting *restrict matting,
+                              LayeredSize size, LayeredResolve resolve, __local float *restrict lines)
 {
     const int lid = get_local_id(0), items = get_local_size(0);
     const int tx = get_group_id(0), ty = get_group_id(1);
     const int x0 = tx * LAYERED_TILE, y0 = ty * FIR_ROWS;
-    const LayeredLayer own = layered_layer(&matting, resolve.layer);
+    const LayeredLayer own = layered_layer(matting, resolve.layer);
     const uint peels = tile_peels[((size_t)resolve.layer * size.tiles_y + ty) * size.tiles_x + tx];
     const int has_front = layered_is_reached(front_reached, resolve.front, tx, ty, resolve.radius_front, size);
     const int has_back = layered_is_reached(back_reached, resolve.back, tx, ty, resolve.radius_back, size);

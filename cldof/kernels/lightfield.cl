@@ -680,19 +680,16 @@ static inline float4 jittered_color(const __global float *color, const __global 
 #if LIGHTFIELD_LEVELS
 #undef MIP_PARAMS
 #undef MIP_ARGS
-#define MIP_PARAMS , const __global float *mips, const __global float *mip_depths, LightfieldMips mip_sizes
-#define MIP_ARGS , mips, mip_depths, mip_sizes
-typedef struct {
-    int width[LIGHTFIELD_LEVELS], height[LIGHTFIELD_LEVELS], first[LIGHTFIELD_LEVELS]; /* pixels; of level 1 and up */
-} LightfieldMips;
+#define MIP_PARAMS , const __global float *mips, const __global float *mip_depths, const __global int4 *mip_table
+#define MIP_ARGS , mips, mip_depths, mip_table
 
 /* Colour from the pyramid, bilinear between what is of the winner's surface; .w of the result is -1 if nothing is. */
-static inline float4 mip_color(const __global float *mips, const __global float *mip_depths, LightfieldMips sizes,
+static inline float4 mip_color(const __global float *mips, const __global float *mip_depths, int4 size,
                                LightfieldLens lens, int level, int m, int ray_x, int ray_y, float w, float c,
                                float4 base)
 {
-    const int width = sizes.width[level - 1], height = sizes.height[level - 1];
-    const size_t first = sizes.first[level - 1] + (size_t)m * width * height;
+    const int width = size.x, height = size.y;
+    const size_t first = size.z + (size_t)m * width * height;
     const float scale = 1.0f / (SUB * (float)(1 << level));
     const float x = (float)ray_x * scale, y = (float)ray_y * scale; /* texel i stands on pixel i * 2^level */
     const int x0 = (int)(x < 0.0f ? 0.0f : x), y0 = (int)(y < 0.0f ? 0.0f : y);
@@ -784,7 +781,7 @@ static inline float4 ray_color(const __global float *color, const __global float
     /* The nearest whole level: log2(width) rounded. */
     for (float step = 1.41421356f; level < LIGHTFIELD_LEVELS && width >= step; step *= 2.0f) level++;
     for (; level > 0; level--) {
-        const float4 wide = mip_color(mips, mip_depths, mip_sizes, lens, level, m, ray_x, ray_y, w, c, base);
+        const float4 wide = mip_color(mips, mip_depths, mip_table[level - 1], lens, level, m, ray_x, ray_y, w, c, base);
         if (wide.w >= 0.0f) return wide;
     }
 #endif
@@ -965,6 +962,7 @@ static inline float4 pinhole(const __global float *color, LightfieldSize size, i
  *         cells      uchar[peels][height][pitch]
  *         views      LightfieldView[]
  *         mips, mip_depths  see lightfield_shrink; with LIGHTFIELD_LEVELS
+ *         mip_table  int4[LIGHTFIELD_LEVELS]  width, height and first pixel, of level 1 and up
  *         surface, lighting, environment  see shading.cl; with LIGHTFIELD_SHADED, where `color` lacks what is mirrored
  *                                         and whole_color does not
  * updates sum        float[out_height][out_pitch][4]  colours so far, when not all views come at once
@@ -977,7 +975,7 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
                                     const __global uchar *restrict cells, const __global LightfieldView *restrict views,
 #if LIGHTFIELD_LEVELS
                                     const __global float *restrict mips, const __global float *restrict mip_depths,
-                                    LightfieldMips mip_sizes,
+                                    const __global int4 *restrict mip_table,
 #endif
 #if LIGHTFIELD_SHADED
                                     const __global float *restrict whole_color, const __global float *restrict surface,

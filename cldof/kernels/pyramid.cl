@@ -61,6 +61,12 @@ typedef struct {
     float seam[PYRAMID_COUNT];
 } PyramidMatting;
 
+/* pyramid_matting: the frame's matting functions as a buffer. Mesa 22.3 ends the process in kernels that take a struct
+ * with an array by value and look an element up in it.
+ * writes  matting  PyramidMatting
+ * range   1-D, one item */
+__kernel void pyramid_matting(__global PyramidMatting *matting, PyramidMatting given) { *matting = given; }
+
 typedef float8 __attribute__((aligned(4))) float8_unaligned;
 
 static inline float8 load_eight(const __global float *p) { return *(const __global float8_unaligned *)p; }
@@ -260,21 +266,21 @@ static inline void pull_quad(__global float *color, __global float *inv, float16
 /* pyramid_cull: culls a sub-image's foreground and pulls level 1 from what is left.
  * source  sections 3.1 and 3.2; Strengert et al. 2006
  * reads   flat, flat_inv, slope  the stack of RGBZ images
- *         table  int4[sub-images][PYRAMID_LEVELS]
+ *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  fill      float[][4]  level 1 of all sub-images, up to the pitch
  *         fill_inv  float[]
  * range   3-D: (items per row, sub-images, rows of level 1 of the largest sub-image), any local size */
 __kernel void pyramid_cull(__global float *restrict fill, __global float *restrict fill_inv,
                            const __global float *restrict flat, const __global float *restrict flat_inv,
-                           const __global float *restrict slope, const __global int4 *restrict table, PyramidSize size,
-                           PyramidMatting matting)
+                           const __global float *restrict slope, const __global int4 *restrict table,
+                           const __global PyramidMatting *restrict matting, PyramidSize size)
 {
     const int i = get_global_id(1);
     const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
     const int row = (int)get_global_id(2) - (size.top - sub.x) / 2;
     if (row < 0 || row >= level.z) return;
-    const float4 ramp = matting.ramp[i];
-    const float seam = matting.seam[i];
+    const float4 ramp = matting->ramp[i];
+    const float seam = matting->seam[i];
     const int y = 2 * row - sub.x;
     for (int b = get_global_id(0); b < level.w / 8; b += get_global_size(0)) {
         const int x = 16 * b - sub.x;
@@ -473,21 +479,21 @@ static inline float16 box_quad(float16 a, float16 b, float16 c)
  * source  sections 3.3 and 3.4
  * reads   flat, flat_inv, slope  the stack of RGBZ images
  *         fill, fill_inv  level 1 without holes
- *         table  int4[sub-images][PYRAMID_LEVELS]
+ *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  blur  float[][4]  level 1 of all sub-images that have steps
  * range   3-D groups: (segments of a row, sub-images, blocks of PYRAMID_ROWS rows of level 1); local size (any, 1, 1)
  * local   lines  float[2][2 * segment + 32][4]  sums of two rows of level 0, from 16 px before the segment on */
 __kernel void pyramid_matte(__global float *restrict blur, const __global float *restrict flat,
                             const __global float *restrict flat_inv, const __global float *restrict slope,
                             const __global float *restrict fill, const __global float *restrict fill_inv,
-                            const __global int4 *restrict table, PyramidSize size, PyramidMatting matting, int segment,
-                            __local float *restrict lines)
+                            const __global int4 *restrict table, const __global PyramidMatting *restrict matting,
+                            PyramidSize size, int segment, __local float *restrict lines)
 {
     const int lid = get_local_id(0), items = get_local_size(0);
     const int i = get_group_id(1);
     const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
-    const float4 ramp = matting.ramp[i];
-    const float seam = matting.seam[i];
+    const float4 ramp = matting->ramp[i];
+    const float seam = matting->seam[i];
     const int line_width = 2 * segment + 32;
     const int x0 = (int)get_group_id(0) * segment;
     const int first = 2 * x0 - 16; /* level 0 pixel at the start of a line */
@@ -616,14 +622,14 @@ static inline void store_finished(__global float *out, float16 v, PyramidSize si
  * guard band.
  * reads   blur  level 1 of sub-images with steps
  *         flat, flat_inv, slope, fill, fill_inv  for the one in focus, which is not blurred
- *         table  int4[sub-images][PYRAMID_LEVELS]
+ *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  out  float[height - 2*guard][width - 2*guard][4]
  * range   2-D: (items per row, height - 2*guard), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_blend(__global float *restrict out, const __global float *restrict blur,
                             const __global float *restrict flat, const __global float *restrict flat_inv,
                             const __global float *restrict slope, const __global float *restrict fill,
                             const __global float *restrict fill_inv, const __global int4 *restrict table,
-                            PyramidSize size, PyramidMatting matting, int count)
+                            const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
     const int y = size.guard + (int)get_global_id(1);
     for (int x = size.guard / 16 * 16 + 16 * (int)get_global_id(0); x < size.width - size.guard;
@@ -633,8 +639,8 @@ __kernel void pyramid_blend(__global float *restrict out, const __global float *
             const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
             float16 quad[4];
             if (sub.y == 0) {
-                if (!matted_block(quad, flat, flat_inv, slope, fill, fill_inv, sub, level, size, matting.ramp[i],
-                                  matting.seam[i], x, y)) continue;
+                if (!matted_block(quad, flat, flat_inv, slope, fill, fill_inv, sub, level, size, matting->ramp[i],
+                                  matting->seam[i], x, y)) continue;
             } else {
                 const Between rows = between(level, y + sub.x);
                 expand_quad(quad, blur, rows, (x + sub.x) / 2);

@@ -437,6 +437,7 @@ class _Builder:
             Buffer("color", shape.layers * self.pixels * 16, Role.INPUT),
             Buffer("inv_depth", shape.layers * shape.height * shape.pitch * 4, Role.INPUT),
             Buffer("image", math.prod(shape.output_size) * 16, Role.OUTPUT),
+            Buffer("matting", _MATTING.itemsize),
             Buffer("tile_peels", stack.total * self.tiles_x * self.tiles_y * 4),
         ]
         self.passes: list[Pass] = []
@@ -476,9 +477,10 @@ class _Builder:
             self._each_by_itself(run)
 
     def _classify(self) -> None:
+        self._add("layered_matting", (write("matting"), Param("matting", _MATTING)), (1,))
         self._add(
             "layered_classify",
-            (write("tile_peels"), read("inv_depth"), self.size, np.int32(self.stack.total), Param("matting", _MATTING)),
+            (write("tile_peels"), read("inv_depth"), read("matting"), self.size, np.int32(self.stack.total)),
             (self.tiles_x, self.tiles_y),
             traffic_bytes=self.shape.layers * self.shape.height * self.shape.pitch * 4,
         )
@@ -546,9 +548,9 @@ class _Builder:
                 read("inv_depth"),
                 read("tile_peels"),
                 read("taps"),
+                read("matting"),
                 self.size,
                 step,
-                Param("matting", _MATTING),
                 Local(blocking.rows * (segment + 2 * _halo(radius_out)) * 16),
                 Local((segment // _TILE + 2 * halo_tiles) * 4),
             ),
@@ -608,9 +610,9 @@ class _Builder:
                 read("inv_depth"),
                 read("tile_peels"),
                 read("taps"),
+                read("matting"),
                 self.size,
                 resolve,
-                Param("matting", _MATTING),
                 Local(self.blocking.rows * _TILE * 16),
             ),
             (self.tiles_x * self.local_size, self.tiles_y),

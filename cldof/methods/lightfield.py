@@ -382,9 +382,9 @@ class _Builder:
                 numbers = (self.peels, *sizes[level - 1], firsts[level - 1], firsts[level])
                 args = (read_write("mips"), read_write("mip_depths"), self.lens, *map(np.int32, numbers))
                 self._add("lightfield_shrink_again", args, range_)
-        record = np.dtype([(name, np.int32, (self.views.levels,)) for name in ("width", "height", "first")])
-        value: Any = np.array((*zip(*sizes[1:], strict=True), firsts[1:]), record)
-        return read("mips"), read("mip_depths"), value[()]
+        table = np.array([(*size, first, 0) for size, first in zip(sizes[1:], firsts[1:], strict=True)], np.int32)
+        self.buffers.append(Buffer("mip_table", table.nbytes, Role.CONSTANT, table))
+        return read("mips"), read("mip_depths"), read("mip_table")
 
     def _warp_by_view(self, first: int, count: int) -> None:
         wanted = -(-_ITEMS_PER_CORE * self.traits.compute_units // count)

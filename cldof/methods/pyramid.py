@@ -401,23 +401,29 @@ class _Builder:
             Buffer("inv_depth", shape.layers * self.frame_pixels * 4, Role.INPUT),
             Buffer("image", math.prod(shape.output_size) * 16, Role.OUTPUT),
             Buffer("table", self.table.nbytes, Role.CONSTANT, self.table),
+            Buffer("matting", _MATTING.itemsize),
         ]
         self.passes: list[Pass] = []
         self.defines: tuple[tuple[str, int], ...] = ()
 
     def build(self) -> FrameProgram:
+        self._set_defines(0)
+        self._add("pyramid_matting", (write("matting"), Param("matting", _MATTING)), (1,))
         self._run("rgb", 0)
         if not self.shape.is_opaque:
             self._run("alpha", 1)
         return FrameProgram.of(self.buffers, self.passes)
 
-    def _run(self, run: str, alpha: int) -> None:
+    def _set_defines(self, alpha: int) -> None:
         self.defines = (
             ("PYRAMID_PAPER", int(self.method.matting == "paper")),
             ("PYRAMID_VOID", int(not self.shape.is_opaque)),
             ("PYRAMID_ALPHA", alpha),
             ("PYRAMID_DIVIDE", int(self.method.normalise)),
         )
+
+    def _run(self, run: str, alpha: int) -> None:
+        self._set_defines(alpha)
         flat, inv, slope, fill, fill_inv, blur = (
             f"{run}_{name}" for name in ("flat", "flat_inv", "slope", "fill", "fill_inv", "blur")
         )
@@ -435,7 +441,7 @@ class _Builder:
         ):
             self.buffers.append(Buffer(name, nbytes))
 
-        matting = Param("matting", _MATTING)
+        tables = (read("table"), read("matting"))
         rgbz = (read(flat), read(inv), read(slope))
         filled = (read(fill), read(fill_inv))
         rows = self.sources * self.shape.height
@@ -455,7 +461,7 @@ class _Builder:
         updated = (read_write(fill), read_write(fill_inv), read("table"))
         self._add(
             "pyramid_cull",
-            (write(fill), write(fill_inv), *rgbz, read("table"), self.size, matting),
+            (write(fill), write(fill_inv), *rgbz, *tables, self.size),
             self._over_levels(1),
             traffic=20 * (self.count * self.pixels + self._area(1)),
         )
@@ -467,7 +473,7 @@ class _Builder:
             traffic = 4 * self._area(k)
             self._add("pyramid_push", (*updated, np.int32(k)), self._over_levels(k), traffic=traffic)
         if steps:
-            self._matte(write(blur), (*rgbz, *filled, read("table"), self.size, matting))
+            self._matte(write(blur), (*rgbz, *filled, *tables, self.size))
         blurred = (read_write(blur), read("table"))
         for k in range(1, steps):
             traffic = 16 * (self._area(k, k) + self._area(k + 1, k))
@@ -484,9 +490,8 @@ class _Builder:
                 read(blur),
                 *rgbz,
                 *filled,
-                read("table"),
+                *tables,
                 self.size,
-                matting,
                 np.int32(self.count),
             ),
             (self.items, self.shape.output_size[0]),

@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cldof import Lens, Renderer
 from cldof.errors import DeviceError, InputError
 from cldof.host import hazards, scheduler
 from cldof.host import opencl as cl
 from cldof.host.buffers import BufferPool
 from cldof.host.device import Device, DeviceInfo
 from cldof.host.passes import Buffer, FrameProgram, Local, Param, Pass, Role, read, read_write, write
-from cldof.host.quirks import Effect
-from tests.frames import noise_frame
 
 F32, I32 = np.dtype(np.float32), np.dtype(np.int32)
 N = 4096
@@ -159,20 +156,6 @@ def test_frame_waits_for_the_callers_events(toy_out_of_order: Device, make_gate:
         assert submission.event.command_execution_status != cl.command_execution_status.COMPLETE
         gate.open()
         submission.wait()
-
-
-@pytest.mark.parametrize("method", ["layered", "pyramid"])
-def test_drivers_that_crash_on_arrays_in_arguments_are_not_given_any(
-    method: str, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Seen through the renderer, as users would; without such arguments the same device goes on working."""
-    frame = noise_frame(16, 8, 2)
-    lens = Lens(3.0 / frame.camera.focal_px, 2.0)
-    monkeypatch.setattr(scheduler, "effects_of", lambda platform, name: {Effect.NO_ARRAY_ARGUMENTS})
-    with Renderer(method, device=device.info.index) as renderer, pytest.raises(DeviceError, match="another device"):
-        renderer.render(frame, lens)
-    with Renderer("gather", device=device.info.index) as renderer:
-        assert np.isfinite(renderer.render(frame, lens).image).all()
 
 
 # -- again and again
