@@ -43,6 +43,7 @@ test-devices:
 
 test-oclgrind:
 	@scripts/setup.sh test
+	$(VENV)/python -m tests.tools.checked --private
 	@scripts/setup.sh oclgrind
 	@if command -v oclgrind >/dev/null; then $(VENV)/python -m tests.tools.checked $(ARGS); \
 	else echo "SKIPPED: oclgrind is not here and cannot be installed; no kernel was checked" >&2; fi

@@ -17,6 +17,7 @@ from typing import Any
 import hypothesis
 import numpy as np
 import pytest
+from hypothesis.database import DirectoryBasedExampleDatabase
 
 from cldof.errors import DeviceError
 from cldof.host import opencl as cl
@@ -24,7 +25,18 @@ from cldof.host.buffers import BufferPool
 from cldof.host.device import Device, DeviceInfo, Traits, list_devices
 from cldof.host.quirks import prepare_environment, user_cache_dir
 
-hypothesis.settings.register_profile("cldof", deadline=None, derandomize="CI" in os.environ)
+_REPOSITORY = Path(__file__).parents[1]
+
+# A failing example is kept in `.hypothesis/examples` of the repository, whatever folder tests are started from, and
+# tried first the next time. In CI nothing is left to chance and nothing kept. A failure prints the line
+# (`@reproduce_failure(...)`) that makes it happen again elsewhere.
+hypothesis.settings.register_profile(
+    "cldof",
+    deadline=None,
+    derandomize="CI" in os.environ,
+    print_blob=True,
+    database=None if "CI" in os.environ else DirectoryBasedExampleDatabase(_REPOSITORY / ".hypothesis" / "examples"),
+)
 hypothesis.settings.load_profile("cldof")
 
 CANARY = 0xA5

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,17 @@ import numpy as np
 
 import cldof.kernels
 from cldof import Camera, LayeredFrame, Lens, Renderer
+from cldof.host import opencl as cl
 from cldof.host.device import Device
+from cldof.host.program import BUILD_OPTIONS, Defines, SourceDirectory, expand
 from cldof.methods import gaussian
 from tests.frames import noise_frame
 from tests.kernels import test_blur as blur
 from tests.shaded import shaded_frame
 
-__all__ = ["CASES", "Case", "kernels_in_sources", "record_kernels"]
+__all__ = ["CASES", "Case", "FilledSources", "Program", "kernels_in_sources", "record_kernels", "unset_variables"]
+
+Program = tuple[str, Defines]  # stem of the file, and defines
 
 WIDTH, HEIGHT = 48, 32
 
@@ -132,14 +137,16 @@ CASES: list[Case] = list(_cases())
 
 
 @contextmanager
-def record_kernels(device: Device) -> Iterator[set[str]]:
-    """Names of the kernels that are made inside the block."""
+def record_kernels(device: Device, programs: set[Program] | None = None) -> Iterator[set[str]]:
+    """Names of the kernels that are made inside the block; adds the programs that they are of to `programs`."""
     names: set[str] = set()
     make = device.programs.kernel
 
-    def recorded(stem: str, name: str, *rest: Any) -> Any:
+    def recorded(stem: str, name: str, defines: Defines = ()) -> Any:
         names.add(name)
-        return make(stem, name, *rest)
+        if programs is not None:
+            programs.add((stem, tuple(defines)))
+        return make(stem, name, defines)
 
     device.programs.kernel = recorded  # type: ignore[method-assign]
     try:
@@ -152,3 +159,75 @@ def kernels_in_sources() -> set[str]:
     """Every kernel of the library."""
     folder = Path(next(iter(cldof.kernels.__path__)))
     return {name for file in folder.glob("*.cl") for name in re.findall(r"__kernel\s+void\s+(\w+)", file.read_text())}
+
+
+# Clang's own analysis, asked for inside the source, since PoCL takes no -W. What is no type saves compiling the rest.
+_WATCHED = ("uninitialized", "sometimes-uninitialized", "conditional-uninitialized", "array-bounds", "return-type")
+_STOP = "what_nobody_declares"
+
+
+def unset_variables(device: Device, program: Program, directory: SourceDirectory) -> list[str] | None:
+    """What the compiler says about variables that are read before they are set on some way, and the like.
+
+    Returns
+    -------
+    list of str
+        One line each; None if the compiler is none of Clang's family and cannot be asked.
+    """
+    stem, defines = program
+    asked = "".join(f'#pragma clang diagnostic error "-W{name}"\n' for name in _WATCHED)
+    source = f"{asked}{expand(stem, defines, directory)}\ntypedef {_STOP} stop;\n"
+    built = cl._cl._Program(device.context, source)
+    with suppress(cl.Error):
+        built._build(options=" ".join(BUILD_OPTIONS).encode(), devices=[device.queue.device])
+    log = built.get_build_info(device.queue.device, cl.program_build_info.LOG)
+    said = [line.strip() for line in log.splitlines() if "error: " in line]
+    if not any(_STOP in line for line in said):
+        return None
+    return [line for line in said if _STOP not in line]
+
+
+# A declaration without a value: vectors, arrays and scalars, by the line.
+_UNSET = re.compile(
+    r"^ +(?:u?int|float|shading_t)(?:2|3|4|8|16)? (?P<names>\w+(?:\[[^\]]+\])*(?:, \w+(?:\[[^\]]+\])*)*);"
+)
+_STRUCT = re.compile(r"(?:typedef )?struct\b[^;]*\{$")
+
+
+class FilledSources:
+    """The kernels, but for private variables that are declared without a value: these begin as `fill`.
+
+    Parameters
+    ----------
+    fill : int
+        Every byte of them.
+    real : SourceDirectory, optional
+        Other kernels than the library's.
+    """
+
+    def __init__(self, fill: int, real: Any = None) -> None:
+        self._fill = fill
+        self._real = files("cldof.kernels") if real is None else real
+
+    def joinpath(self, name: str) -> FilledSources:
+        """The file of that name."""
+        return FilledSources(self._fill, self._real.joinpath(name))
+
+    def is_file(self) -> bool:
+        """Whether it is there."""
+        return self._real.is_file()
+
+    def read_text(self, encoding: str) -> str:
+        """Its text, with as many lines as before."""
+        lines, in_struct = [], False
+        for line in self._real.read_text(encoding=encoding).splitlines():
+            in_struct = line[:1] != "}" and (in_struct or bool(_STRUCT.match(line)))
+            if (found := _UNSET.match(line)) and not in_struct:
+                names = [name.split("[")[0].strip() for name in found["names"].split(",")]
+                line = line[: found.end()] + "".join(map(self._filled, names)) + line[found.end() :]
+            lines.append(line)
+        return "\n".join(lines) + "\n"
+
+    def _filled(self, name: str) -> str:
+        loop = f"for (uint i_ = 0; i_ < sizeof({name}); i_++)"
+        return f" {loop} ((volatile uchar *)&{name})[i_] = {self._fill};"

@@ -52,13 +52,21 @@ def one_plane(depth_m: float | np.ndarray, image: np.ndarray | None = None, came
 
 
 def keep_promises(subject: Subject, case: str, frame: LayeredFrame, image: np.ndarray) -> None:
-    """No light below 0 or above the brightest in the frame; alpha within 0 and 1, and 1 where all is opaque."""
+    """No light below 0 or above the brightest in the frame; alpha within 0 and 1, and 1 where all is opaque.
+
+    Asked of the image, and of what the last :meth:`Subject.render` rendered without a plan.
+    """
     paint = frame.color[..., :3] / np.where(frame.color[..., 3:] > 0, frame.color[..., 3:], 1.0)
     scale = float(paint.max()) or 1.0
+    for one in (image,) if subject.full is None else (image, subject.full):
+        _keep(subject, case, one, scale, frame.is_opaque)
+
+
+def _keep(subject: Subject, case: str, image: np.ndarray, scale: float, is_opaque: bool) -> None:
     alpha = image[..., 3]
     above = (image[..., :3] - (1.0 + _BRIGHTER) * scale * alpha[..., None]).max()
     subject.check(case, "light below 0 / brightest", max(0.0, -image[..., :3].min()) / scale, _NEGATIVE)
     subject.check(case, "light above alpha * brightest / brightest", max(0.0, above) / scale, _BRIGHTER)
     subject.check(case, "alpha outside 0..1", max(0.0, -alpha.min(), alpha.max() - 1.0), _ALPHA)
-    if frame.is_opaque:
+    if is_opaque:
         subject.check(case, "opaque: 1 - alpha", 1.0 - alpha.min(), _OPAQUE_OF.get(subject.name, _OPAQUE))

@@ -1,13 +1,14 @@
 """Property-based: random frames and lenses keep what DESIGN section 4 promises, for every method.
 
-What hypothesis finds is shrunk and belongs here as an ``@example``; its own database lies in ``.hypothesis``.
+What hypothesis finds is shrunk, kept in its database (tests/conftest.py says where) and tried first the next time; it
+belongs here as an ``@example``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -31,76 +32,110 @@ LIGHT = st.one_of(st.sampled_from([0.0, 1e-8, 0.5, 1.0, 1e6]), st.floats(0.0, 2.
 ALPHA = st.sampled_from([0.0, 1.0 / 255.0, 0.5, 254.0 / 255.0, 1.0])
 
 
-@st.composite
-def frames(draw: Callable[..., Any], opaque: bool) -> LayeredFrame:
-    """A few slots of a few surfaces, scattered over pixels by a small pattern."""
-    width, height, peels = draw(st.integers(1, 40)), draw(st.integers(1, 30)), draw(st.integers(1, 4))
-    guard_px = draw(st.sampled_from([0, 0, 2]))
-    kinds = draw(st.lists(st.tuples(DEPTHS, LIGHT, LIGHT, ALPHA), min_size=1, max_size=5))
-    side, seed = draw(st.integers(1, 8)), draw(st.integers(0, 99))
-    rng = np.random.default_rng(seed)
-    shape = (peels, height + 2 * guard_px, width + 2 * guard_px)
-    coarse = rng.integers(0, len(kinds), (peels, shape[1] // side + 1, shape[2] // side + 1))
-    kind = coarse.repeat(side, 1).repeat(side, 2)[:, : shape[1], : shape[2]]
-    table = np.array(kinds, np.float32)[kind]
-    order = np.argsort(table[..., 0], axis=0, kind="stable")
-    table = np.take_along_axis(table, order[..., None], 0)
-    alpha = table[..., 3].copy()
-    if opaque:
-        alpha[-1] = 1.0
-    color = np.stack([table[..., 1], table[..., 2], np.zeros(shape, np.float32), np.ones(shape, np.float32)], -1)
-    return LayeredFrame(
-        color * alpha[..., None], np.ascontiguousarray(table[..., 0]), Camera(width, height, 40.0), guard_px=guard_px
-    )
+class Scene(NamedTuple):
+    """A few kinds of surface, (depth, red, green, alpha) each, scattered over pixels and peels by a small pattern.
+
+    All that a frame is made of, so that what hypothesis prints of a failure can be written down as an ``@example``.
+    """
+
+    width: int
+    height: int
+    peels: int
+    guard_px: int
+    kinds: list[tuple[float, float, float, float]]
+    side: int
+    seed: int
+
+    def frame(self, opaque: bool) -> LayeredFrame:
+        """Peels by increasing depth, the last without holes if it has to be opaque."""
+        rng = np.random.default_rng(self.seed)
+        shape = (self.peels, self.height + 2 * self.guard_px, self.width + 2 * self.guard_px)
+        coarse = rng.integers(0, len(self.kinds), (self.peels, shape[1] // self.side + 1, shape[2] // self.side + 1))
+        kind = coarse.repeat(self.side, 1).repeat(self.side, 2)[:, : shape[1], : shape[2]]
+        table = np.array(self.kinds, np.float32)[kind]
+        order = np.argsort(table[..., 0], axis=0, kind="stable")
+        table = np.take_along_axis(table, order[..., None], 0)
+        alpha = table[..., 3].copy()
+        if opaque:
+            alpha[-1] = 1.0
+        color = np.stack([table[..., 1], table[..., 2], np.zeros(shape, np.float32), np.ones(shape, np.float32)], -1)
+        camera = Camera(self.width, self.height, 40.0)
+        depth = np.ascontiguousarray(table[..., 0])
+        return LayeredFrame(color * alpha[..., None], depth, camera, guard_px=self.guard_px)
 
 
-@st.composite
-def lenses(draw: Callable[..., Any], camera: Camera) -> Lens:
-    """From pinholes to apertures wider than the scene; CoC of ``coc_px`` one metre in inverse depth from focus."""
-    coc_px = draw(st.one_of(st.sampled_from([0.0, 1e-6, 0.25, 0.5, 1.0]), st.floats(0.0, 60.0)))
-    focus_m = draw(st.one_of(st.sampled_from([1e-3, 1.0, 1e6, math.inf]), st.floats(1e-3, 1e3)))
-    return Lens(coc_px / camera.focal_px, focus_m)
+SCENES = st.builds(
+    Scene,
+    width=st.integers(1, 40),
+    height=st.integers(1, 30),
+    peels=st.integers(1, 4),
+    guard_px=st.sampled_from([0, 0, 2]),
+    kinds=st.lists(st.tuples(DEPTHS, LIGHT, LIGHT, ALPHA), min_size=1, max_size=5),
+    side=st.integers(1, 8),
+    seed=st.integers(0, 99),
+)
+# From pinholes to apertures wider than the scene: CoC one metre in inverse depth from focus, px, and the focus.
+COC = st.one_of(st.sampled_from([0.0, 1e-6, 0.25, 0.5, 1.0]), st.floats(0.0, 60.0))
+FOCUS = st.one_of(st.sampled_from([1e-3, 1.0, 1e6, math.inf]), st.floats(1e-3, 1e3))
+
+# Found: slots without light or coverage at finite depths, in front of a wall and of void.
+CLEAR_SLOTS = Scene(24, 16, 2, 0, [(0.5, 0.0, 0.0, 0.0), (4.0, 1.0, 0.5, 1.0)], 3, 0)
+# A lamp of 1e6 in one pixel of glass among void at infinity, in an image of a few pixels.
+LAMP = Scene(5, 3, 3, 2, [(1e-3, 1e6, 0.0, 1.0 / 255.0), (math.inf, 1e-8, 0.0, 0.0), (1.0, 0.0, 1e6, 1.0)], 1, 7)
+# Two surfaces a rounding apart, at focus and not.
+FIGHTING = Scene(31, 17, 2, 0, [(1.0, 1.0, 0.0, 1.0), (1.0000001, 0.0, 1.0, 1.0), (1e6, 0.5, 0.5, 1.0)], 1, 3)
+
+
+def lens_of(frame: LayeredFrame, coc_px: float, focus_m: float) -> Lens:
+    return Lens(coc_px / frame.camera.focal_px, focus_m)
 
 
 @pytest.mark.parametrize("opaque", [True, False], ids=["opaque", "void"])
 @hard
-@given(data=st.data())
-def test_promises(method: Subject, opaque: bool, data: st.DataObject) -> None:
-    frame = data.draw(frames(opaque))
-    lens = data.draw(lenses(frame.camera))
-    keep_promises(method, "random frames", frame, method.render(frame, lens))
+@given(scene=SCENES, coc_px=COC, focus_m=FOCUS)
+@example(scene=CLEAR_SLOTS, coc_px=9.0, focus_m=2.0)
+@example(scene=LAMP, coc_px=60.0, focus_m=math.inf)
+@example(scene=FIGHTING, coc_px=0.5, focus_m=1.0)
+def test_promises(method: Subject, opaque: bool, scene: Scene, coc_px: float, focus_m: float) -> None:
+    frame = scene.frame(opaque)
+    keep_promises(method, "random frames", frame, method.render(frame, lens_of(frame, coc_px, focus_m)))
 
 
 @hard
-@given(data=st.data(), light=LIGHT)
-def test_one_colour_stays(method: Subject, data: st.DataObject, light: float) -> None:
+@given(scene=SCENES, coc_px=COC, focus_m=FOCUS, light=LIGHT)
+@example(scene=CLEAR_SLOTS, coc_px=9.0, focus_m=2.0, light=1.0)
+@example(scene=FIGHTING, coc_px=60.0, focus_m=1e6, light=1e6)
+def test_one_colour_stays(method: Subject, scene: Scene, coc_px: float, focus_m: float, light: float) -> None:
     """Whatever the depths, an opaque scene of one colour shows that colour."""
-    frame = data.draw(frames(True))
+    frame = scene.frame(True)
     color = np.where(frame.color[..., 3:] > 0, np.float32((light, light, light, 1.0)), 0).astype(np.float32)
     frame = LayeredFrame(color, frame.depth, frame.camera, guard_px=frame.guard_px)
-    image = method.render(frame, data.draw(lenses(frame.camera)))
+    image = method.render(frame, lens_of(frame, coc_px, focus_m))
     off = np.abs(image[..., :3] - np.float32(light)).max() / (light or 1.0)
     method.check("random frames", "one colour off by, share", off, 1e-3)
 
 
 @hard
-@given(data=st.data(), focus_m=st.sampled_from([1e-3, 0.3, 1.0, 2.0, 1e3, math.inf]), coc_px=st.floats(0.0, 100.0))
-def test_in_focus_nothing_changes(method: Subject, data: st.DataObject, focus_m: float, coc_px: float) -> None:
+@given(scene=SCENES, focus_m=st.sampled_from([1e-3, 0.3, 1.0, 2.0, 1e3, math.inf]), coc_px=st.floats(0.0, 100.0))
+@example(scene=LAMP, focus_m=math.inf, coc_px=100.0)
+def test_in_focus_nothing_changes(method: Subject, scene: Scene, focus_m: float, coc_px: float) -> None:
     """One opaque plane in focus, whatever the lens."""
-    frame = data.draw(frames(True))
+    frame = scene.frame(True)
     focus_m = float(np.float32(focus_m))
     depth = np.full(frame.depth.shape[1:], focus_m, np.float32)
     alone = LayeredFrame(frame.color[-1], depth, frame.camera, guard_px=frame.guard_px)
-    image = method.render(alone, Lens(coc_px / frame.camera.focal_px, focus_m))
+    image = method.render(alone, lens_of(frame, coc_px, focus_m))
     pinhole = alone.pinhole_image()
     off = (np.abs(image - pinhole) / np.maximum(1.0, pinhole.max())).max()
     method.check("random frames", "in focus, changed by", off, 2e-6)
 
 
 @hard
-@given(data=st.data(), opaque=st.booleans(), focus_m=st.sampled_from([1e-3, 1.0, math.inf]))
-def test_a_pinhole_is_the_pinhole_image(method: Subject, data: st.DataObject, opaque: bool, focus_m: float) -> None:
-    frame = data.draw(frames(opaque))
+@given(scene=SCENES, opaque=st.booleans(), focus_m=st.sampled_from([1e-3, 1.0, math.inf]))
+@example(scene=CLEAR_SLOTS, opaque=False, focus_m=1.0)
+@example(scene=LAMP, opaque=False, focus_m=1.0)
+def test_a_pinhole_is_the_pinhole_image(method: Subject, scene: Scene, opaque: bool, focus_m: float) -> None:
+    frame = scene.frame(opaque)
     panes = ((frame.color[..., 3] > 0) & (frame.color[..., 3] < 0.999)).sum(axis=0).max()
     assume(panes <= 2 or method.method != "lightfield")
     pinhole = frame.pinhole_image()
@@ -133,11 +168,14 @@ def test_the_same_bits_on_a_new_renderer(
 # Mirrored lenses: samples of the others are not symmetric themselves.
 @pytest.mark.parametrize("name", ["layered"])
 @hard
-@given(data=st.data(), opaque=st.booleans())
-def test_mirror_symmetry(subjects: Callable[[str], Subject], name: str, data: st.DataObject, opaque: bool) -> None:
+@given(scene=SCENES, coc_px=COC, focus_m=FOCUS, opaque=st.booleans())
+@example(scene=LAMP, coc_px=7.0, focus_m=2.0, opaque=False)
+def test_mirror_symmetry(
+    subjects: Callable[[str], Subject], name: str, scene: Scene, coc_px: float, focus_m: float, opaque: bool
+) -> None:
     method = subjects(name)
-    frame = data.draw(frames(opaque))
-    lens = data.draw(lenses(frame.camera))
+    frame = scene.frame(opaque)
+    lens = lens_of(frame, coc_px, focus_m)
     mirrored = LayeredFrame(
         np.ascontiguousarray(frame.color[:, ::-1, ::-1]),
         np.ascontiguousarray(frame.depth[:, ::-1, ::-1]),

@@ -6,6 +6,9 @@ their own, since the simulator's limit of messages is one for all, and is not th
 ``--uninitialized`` also looks for use of what was never written. Debian's oclgrind 21.10 cannot follow every
 instruction of today's compilers then (``freeze``); kernels at which it gives up are named. What was never written in
 *buffers* is looked for without it, in tests/test_every_kernel.py.
+
+``--private`` needs no simulator: on the default device, private variables that are declared without a value begin as
+NaN and then as other garbage, and all pictures have to have the bits that they always have.
 """
 
 from __future__ import annotations
@@ -24,7 +27,9 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from tests.every_kernel import CASES, kernels_in_sources, record_kernels
+import numpy as np
+
+from tests.every_kernel import CASES, Case, FilledSources, kernels_in_sources, record_kernels
 
 __all__ = ["main", "messages_of"]
 
@@ -48,10 +53,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", default=[""], help="cases whose name contains one of these")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--uninitialized", action="store_true")
+    parser.add_argument("--private", action="store_true")
     parser.add_argument("--inside", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.inside:
         return _inside([int(number) for number in options.inside.split(",")])
+    if options.private:
+        return _filled([case for case in CASES if any(text in case.name for text in options.only)])
     if shutil.which("oclgrind") is None:
         print("oclgrind is not installed (Debian and Ubuntu: apt-get install oclgrind)", file=sys.stderr)
         return 1
@@ -76,6 +84,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seconds = time.perf_counter() - started
     print(f"{len(chosen)} frames, {len(seen)} kernels, {sum(found.values())} findings, {seconds:.0f} s")
     return int(bool(found or failures or missing))
+
+
+def _filled(cases: Sequence[Case]) -> int:
+    from cldof.host.device import Device
+
+    started, wrong = time.perf_counter(), []
+    with (
+        Device.open() as plain,
+        Device.open(sources=FilledSources(0xFF)) as nans,
+        Device.open(sources=FilledSources(0x3E)) as others,
+    ):
+        for case in cases:
+            if case.options.get("warp") == "packed" and not plain.traits.has_int64_atomics:
+                continue
+            image = case.run(plain)
+            if not all(np.array_equal(case.run(device), image) for device in (nans, others)):
+                wrong.append(case.name)
+                print(f"{case.name}: reads private memory that was never written", flush=True)
+    print(f"{len(cases)} frames, {len(wrong)} findings, {time.perf_counter() - started:.0f} s")
+    return int(bool(wrong))
 
 
 def _watched(
