@@ -15,7 +15,6 @@ import pytest
 
 from cldof.host.device import Device, DeviceInfo
 from cldof.host.passes import Buffer, FrameProgram, Pass, Role, write
-from cldof.host.quirks import Effect
 from tests.every_kernel import CASES, Case, FilledSources, Program, kernels_in_sources, record_kernels, unset_variables
 from tests.running import run_program
 
