@@ -19,7 +19,7 @@ import numpy as np
 import cldof.kernels
 from cldof import Camera, LayeredFrame, Lens, Renderer
 from cldof.host import opencl as cl
-from cldof.host.device import Device
+from cldof.host.device import Device, Traits
 from cldof.host.program import BUILD_OPTIONS, Defines, SourceDirectory, expand
 from cldof.methods import gaussian
 from tests.frames import noise_frame
@@ -49,6 +49,15 @@ class Case:
         parts = {**self.options, **self.renderer}
         words = [self.method, self.frame, f"{self.coc_px:g}px", *(f"{key}={value}" for key, value in parts.items())]
         return " ".join(words).replace("/", "")
+
+    def lacks(self, traits: Traits) -> str:
+        """What it needs and the device does not have; nothing as a rule."""
+        warp = self.options.get("warp")
+        if warp == "packed" and not traits.has_int64_atomics:
+            return f"{traits.name} has no 64-bit atomics"
+        if warp == "views" and not traits.has_long_loops:
+            return f"{traits.name} breaks long loops off"
+        return ""
 
     def run(self, device: Device) -> np.ndarray:
         """Render it on a device of the caller's, which is left open."""

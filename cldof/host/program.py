@@ -30,6 +30,9 @@ __all__ = ["BUILD_OPTIONS", "Defines", "ProgramCache", "SourceDirectory", "defau
 # drop tests for NaN and infinity.
 BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info", "-cl-denorms-are-zero")
 
+# For drivers that would vectorize across work-items what works on float16 already.
+_HINTED = "#define __kernel __kernel __attribute__((vec_type_hint(float16)))\n"
+
 Defines = tuple[tuple[str, Any], ...]
 
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"(?P<name>[^"]+)"')
@@ -116,7 +119,10 @@ class ProgramCache:
         self._directory = directory
         self._programs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._lock = Lock()
-        driver_caches = Effect.DRIVER_CACHES_BUILDS in effects_of(device.platform.name, device.name)
+        effects = effects_of(device.platform.name, device.name)
+        is_cpu = bool(device.type & cl.device_type.CPU)
+        self._prefix = _HINTED if is_cpu and Effect.VECTORIZES_VECTORS in effects else ""
+        driver_caches = Effect.DRIVER_CACHES_BUILDS in effects
         self._disk = None if driver_caches or from_source else _DiskCache(cache_dir or default_cache_dir())
 
     def kernel(self, stem: str, name: str, defines: Defines = ()) -> Any:
@@ -149,7 +155,7 @@ class ProgramCache:
         with self._lock:
             program = self._programs.get(key)
             if program is None:
-                program = self._programs[key] = self._build(expand(stem, defines, self._directory))
+                program = self._programs[key] = self._build(self._prefix + expand(stem, defines, self._directory))
         return program
 
     def clear(self) -> None:

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from cldof.errors import BuildError, InputError
+from cldof.host import opencl as cl
 from cldof.host import program as program_module
 from cldof.host.device import Device, DeviceInfo
 from cldof.host.program import ProgramCache, expand, numbered
+from cldof.host.quirks import Effect
 
 KERNEL = "__kernel void toy_one(__global int *out) { out[0] = 1; }\n"
 
@@ -110,6 +112,20 @@ def test_an_unknown_kernel_lists_those_there_are(cached: Callable[[], ProgramCac
     (sources / "toy.cl").write_text(KERNEL)
     with pytest.raises(BuildError, match=r"no kernel 'toy_two'; it has toy_one"):
         cached().kernel("toy", "toy_two")
+
+
+def test_kernels_say_that_they_use_vectors_where_a_driver_for_cpus_needs_to_be_told(
+    device: Device, sources: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (sources / "toy.cl").write_text(KERNEL)
+    texts = []
+    for effects in (frozenset(), frozenset({Effect.VECTORIZES_VECTORS})):
+        monkeypatch.setattr(program_module, "effects_of", lambda platform, device, effects=effects: effects)
+        cache = ProgramCache(device.context, device._cl_device, sources, tmp_path / "cache", from_source=True)
+        assert cache.kernel("toy", "toy_one").num_args == 1
+        texts.append(cache.program("toy").get_info(cl.program_info.SOURCE))
+    assert "vec_type_hint" not in texts[0]
+    assert ("vec_type_hint(float16)" in texts[1]) == device.traits.is_cpu
 
 
 def test_programs_are_built_once_kernels_are_new(
