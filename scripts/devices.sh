@@ -6,8 +6,10 @@
 #   small    PoCL, told to be a device with work-groups of 64 and 32 KiB of local memory
 #   gpu      the same, told to be no CPU as well: the forms that GPUs get
 #   intel    Intel's CPU runtime, from PyPI
-#   rusticl  Mesa's rusticl on llvmpipe; slow, so a few tiny frames
-#   agree    PoCL against Intel's runtime: the same pictures within 70 dB
+#   rusticl  Mesa's rusticl on llvmpipe; slow to build, so a few tiny frames
+#   agree    Intel's runtime and rusticl against PoCL: the same pictures within 70 dB
+# and, only when named, since .ci/run runs it:
+#   quick    PoCL against Intel's runtime, methods without options
 # Installs into .venv and with apt-get; what cannot be had is skipped in so many words.
 set -uo pipefail
 cd "$(dirname "$0")/.."
@@ -33,6 +35,15 @@ test_on() { # name, then variables, then -- and what to run
     env "${variables[@]}" CLDOF_REQUIRE_DEVICE=1 "$python" -m pytest -q -p no:cacheprovider "$@" || failed+=("$name")
 }
 
+plain='^\w+ (opaque|void) 5px$' # the forms of each method without options
+agrees() { # forms, then what to compare PoCL with
+    echo "== $name: ${2%%=*}" >&2
+    # Where the tests keep what PoCL has built.
+    POCL_CACHE_DIR=${POCL_CACHE_DIR:-${XDG_CACHE_HOME:-$HOME/.cache}/cldof-tests} OCL_ICD_VENDORS="$icd" \
+        LD_LIBRARY_PATH="$prefix/lib" RUSTICL_ENABLE=llvmpipe "$python" -m tests.tools.agreement \
+        --only "$1" PoCL=portable "$2" || failed+=("$name ${2%%=*}")
+}
+
 have_intel() {
     local library=$prefix/lib/libintelocl.so
     [ -e "$library" ] || "$python" -m pip install -qq intel-opencl-rt intel-cmplr-lib-rt >&2 || true
@@ -55,7 +66,7 @@ for name in ${*:-two small gpu intel rusticl agree}; do
     intel)
         have_intel || { skip intel "intel-opencl-rt could not be installed"; continue; }
         test_on intel OCL_ICD_VENDORS="$icd" LD_LIBRARY_PATH="$prefix/lib" CLDOF_TEST_DEVICE="intel(r) opencl" -- \
-            --ignore tests/kernels/test_lightfield.py "${fast[@]}" # those take minutes to build there
+            "${fast[@]}"
         ;;
     rusticl)
         have_rusticl || { skip rusticl "mesa-opencl-icd could not be installed"; continue; }
@@ -63,10 +74,12 @@ for name in ${*:-two small gpu intel rusticl agree}; do
             tests/test_every_kernel.py -k "pixel or gather or (40px and not cascade and not lookup) or (multiview and sharp)"
         ;;
     agree)
-        have_intel || { skip agree "intel-opencl-rt could not be installed"; continue; }
-        echo "== agree" >&2
-        OCL_ICD_VENDORS="$icd" LD_LIBRARY_PATH="$prefix/lib" "$python" -m tests.tools.agreement \
-            PoCL=portable "Intel=intel(r) opencl" || failed+=(agree)
+        if have_intel; then agrees "" "Intel=intel(r) opencl"; else skip agree "no intel-opencl-rt to be had"; fi
+        rm -f "$icd"/*
+        if have_rusticl; then agrees "$plain" rusticl=llvmpipe; else skip agree "no mesa-opencl-icd to be had"; fi
+        ;;
+    quick)
+        if have_intel; then agrees "$plain" "Intel=intel(r) opencl"; else skip quick "no intel-opencl-rt to be had"; fi
         ;;
     *) echo "no such device: $name" >&2; exit 2 ;;
     esac

@@ -41,8 +41,8 @@ class Subject:
         Of the method and variant.
     method : str
     options : dict
-    full : ndarray or None
-        The last image without a planner, where it was rendered as well.
+    shown, full : ndarray or None
+        The last image of :meth:`render`, and the same without a planner, where it was rendered as well.
     """
 
     def __init__(self, name: str, info: DeviceInfo, family: str) -> None:
@@ -55,6 +55,7 @@ class Subject:
         if name in METHODS and name != "lightfield" and not self.is_slow:
             renderers.append(Renderer(self.method, device=info.index, planned=False))
         self._unplanned = renderers[1] if len(renderers) > 1 else None
+        self.shown: np.ndarray | None = None
         self.full: np.ndarray | None = None
         self._pools = []
         for renderer in renderers:
@@ -87,7 +88,7 @@ class Subject:
         """The image, float64; finite, and as near to the one without a plan as the plan says, or the test fails."""
         result = self.renderer.render(frame, lens)
         image = _finite(self.name, result.image)
-        self.full = None
+        self.shown, self.full = image, None
         if self._unplanned is not None and not planned_only:
             self.full = _finite(f"{self.name} unplanned", self._unplanned.render(frame, lens).image)
             off = np.abs(image - self.full).max() - result.plan.error_bound

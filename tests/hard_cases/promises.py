@@ -54,11 +54,11 @@ def one_plane(depth_m: float | np.ndarray, image: np.ndarray | None = None, came
 def keep_promises(subject: Subject, case: str, frame: LayeredFrame, image: np.ndarray) -> None:
     """No light below 0 or above the brightest in the frame; alpha within 0 and 1, and 1 where all is opaque.
 
-    Asked of the image, and of what the last :meth:`Subject.render` rendered without a plan.
+    Asked of the image, and if the last :meth:`Subject.render` made it, of what that rendered without a plan.
     """
     paint = frame.color[..., :3] / np.where(frame.color[..., 3:] > 0, frame.color[..., 3:], 1.0)
     scale = float(paint.max()) or 1.0
-    for one in (image,) if subject.full is None else (image, subject.full):
+    for one in (image,) if subject.full is None or subject.shown is not image else (image, subject.full):
         _keep(subject, case, one, scale, frame.is_opaque)
 
 
