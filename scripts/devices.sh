@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Run the tests of kernels and methods on every OpenCL driver that can be installed: devices.sh [pocl|intel|rusticl|...]
+# Run the tests of kernels and methods on every OpenCL driver that can be installed: devices.sh [small|intel|rusticl|...]
 #
 # What is tested, by name (all of them unless named):
 #   two      two PoCL devices of one platform at once
@@ -8,8 +8,9 @@
 #   intel    Intel's CPU runtime, from PyPI
 #   rusticl  Mesa's rusticl on llvmpipe; slow to build, so a few tiny frames
 #   agree    Intel's runtime and rusticl against PoCL: the same pictures within 70 dB
-# and, only when named, since .ci/run runs it:
-#   quick    PoCL against Intel's runtime, methods without options
+# and only when named:
+#   quick    PoCL against Intel's runtime, methods without options; what .ci/run runs
+#   figures  the hard cases on Intel's runtime and rusticl, measured into bench/results/stability.json beside PoCL's
 # Installs into .venv and with apt-get; what cannot be had is skipped in so many words.
 set -uo pipefail
 cd "$(dirname "$0")/.."
@@ -26,6 +27,8 @@ fast=(tests/test_every_kernel.py tests/kernels tests/methods/test_gather.py test
 failed=() skipped=()
 
 skip() { echo "SKIPPED $1: $2" >&2; skipped+=("$1"); }
+intel=(OCL_ICD_VENDORS="$icd" LD_LIBRARY_PATH="$prefix/lib" CLDOF_TEST_DEVICE="intel(r) opencl")
+rusticl=(OCL_ICD_VENDORS="$icd" RUSTICL_ENABLE=llvmpipe CLDOF_TEST_DEVICE=llvmpipe)
 test_on() { # name, then variables, then -- and what to run
     local name=$1; shift
     local variables=()
@@ -46,15 +49,24 @@ agrees() { # forms, then what to compare PoCL with
 
 have_intel() {
     local library=$prefix/lib/libintelocl.so
-    [ -e "$library" ] || "$python" -m pip install -qq intel-opencl-rt intel-cmplr-lib-rt >&2 || true
+    [ -e "$library" ] || timeout 180 "$python" -m pip install -qq --retries 1 --timeout 20 intel-opencl-rt \
+        intel-cmplr-lib-rt >&2 || true
     [ -e "$library" ] || return 1
     echo "$library" >"$icd/intel.icd"
+    shows "${intel[@]}"
 }
 have_rusticl() {
     local found=/etc/OpenCL/vendors/rusticl.icd
     [ -e "$found" ] || scripts/setup.sh rusticl || true
     [ -e "$found" ] || return 1
     cp "$found" "$icd/rusticl.icd"
+    shows "${rusticl[@]}"
+}
+shows() { # whether the driver, once installed, has a device on this machine
+    env "$@" "$python" -c 'import os
+from cldof.host.device import list_devices
+part = os.environ["CLDOF_TEST_DEVICE"]
+raise SystemExit(not any(part in f"{info.platform} {info.name}".lower() for info in list_devices()))'
 }
 
 for name in ${*:-two small gpu intel rusticl agree}; do
@@ -64,13 +76,12 @@ for name in ${*:-two small gpu intel rusticl agree}; do
     small) test_on small CLDOF_TEST_LIMITS=64,32768 -- "${fast[@]}" ;;
     gpu) test_on gpu CLDOF_TEST_LIMITS=64,32768,gpu -- "${fast[@]}" ;;
     intel)
-        have_intel || { skip intel "intel-opencl-rt could not be installed"; continue; }
-        test_on intel OCL_ICD_VENDORS="$icd" LD_LIBRARY_PATH="$prefix/lib" CLDOF_TEST_DEVICE="intel(r) opencl" -- \
-            "${fast[@]}"
+        have_intel || { skip intel "no intel-opencl-rt to be had"; continue; }
+        test_on intel "${intel[@]}" -- "${fast[@]}"
         ;;
     rusticl)
-        have_rusticl || { skip rusticl "mesa-opencl-icd could not be installed"; continue; }
-        test_on rusticl OCL_ICD_VENDORS="$icd" RUSTICL_ENABLE=llvmpipe CLDOF_TEST_DEVICE=llvmpipe -- \
+        have_rusticl || { skip rusticl "no mesa-opencl-icd to be had"; continue; }
+        test_on rusticl "${rusticl[@]}" -- \
             tests/test_every_kernel.py -k "pixel or gather or (40px and not cascade and not lookup) or (multiview and sharp)"
         ;;
     agree)
@@ -80,6 +91,15 @@ for name in ${*:-two small gpu intel rusticl agree}; do
         ;;
     quick)
         if have_intel; then agrees "$plain" "Intel=intel(r) opencl"; else skip quick "no intel-opencl-rt to be had"; fi
+        ;;
+    figures)
+        record=(CLDOF_STABILITY="$PWD/bench/results/stability.json")
+        if have_intel; then test_on figures-intel "${intel[@]}" "${record[@]}" -- tests/hard_cases
+        else skip figures "no intel-opencl-rt to be had"; fi
+        rm -f "$icd"/*
+        if have_rusticl; then test_on figures-rusticl "${rusticl[@]}" "${record[@]}" -- "${small[@]}"
+        else skip figures "no mesa-opencl-icd to be had"; fi
+        "$python" -m bench.stability
         ;;
     *) echo "no such device: $name" >&2; exit 2 ;;
     esac
