@@ -149,7 +149,9 @@ static inline float16 layered_breadth(const __global float *inv_depth, float16 w
  * Slots of the interval before the layer are there to close the seam where a surface goes on into the layer and the
  * blurred end of the layer before it lets through what is behind. The seam is as wide as the blur, so the rise is cut
  * to that width: a surface that does not slope into the layer brings nothing, where the paper's full rise would widen
- * its silhouette.
+ * its silhouette. What crosses the whole interval from one pixel to the next is a silhouette and no slope. A visible
+ * surface that is not broad begins in the layer without weight, see below; before that it must have none either, or it
+ * would show twice while the focus moves on.
  *
  * A visible slot in the layer's own interval is also in the layer before, with weight 1 - t, t being how far it is into
  * the interval. Inside a broad surface it takes its full weight behind that, or the background would show through; of a
@@ -169,10 +171,15 @@ static inline float16 layered_weight(const __global float *inv_depth, const __gl
     if (peel > 0) down = before * layer.own.z + layer.own.w >= 1.0f ? down : at_once;
     float16 between = rising > 0.0f && rising < 1.0f ? one : zero;
     if (sum16(between) > 0.0f) {
-        float16 part = layered_slope(inv, w, size, x, y, -2.0f / layer.own.x) * (-layer.own.x * layer.reach);
+        float16 part = layered_slope(inv, w, size, x, y, -1.0f / layer.own.x) * (-layer.own.x * layer.reach);
         part = part > 1.0f ? one : part;
         part = part < 1e-3f ? (float16)(1e-3f) : part;
         up = clamp01((rising - 1.0f) / part + 1.0f);
+        float16 early = between * up;
+        if (peel == 0 && sum16(early) > 0.0f) {
+            float16 broad = layered_breadth(inv_depth, w, size, layer, x, y) * 2.0f - 1.0f;
+            up = early > 0.0f ? up * clamp01(broad) : up;
+        }
     }
     float16 rest = clamp01(w * layer.before.z + layer.before.w); /* 1 - t */
     float16 shared = rising >= 1.0f && falling >= 1.0f && w >= 0.0f ? rest : zero;

@@ -100,8 +100,12 @@ def weights(coc: np.ndarray, alpha: np.ndarray, layers: np.ndarray, paper: bool)
                 if m:
                     fall = (falling >= 1).astype(float)
             else:
-                part = np.clip(slope(c, 2 * rise_width) / rise_width * 2.0 * widest, 1e-3, 1.0)
-                rise = np.where(rising >= 1, 1.0, np.clip(1.0 + (rising - 1.0) / part, 0, 1))
+                part = np.clip(slope(c, rise_width) / rise_width * 2.0 * widest, 1e-3, 1.0)
+                early = np.clip(1.0 + (rising - 1.0) / part, 0, 1)
+                if k > 0 and m == 0:
+                    broad = breadth(c, max(1, round(widest)), z[k] - z[k - 1])
+                    early = early * np.clip(2.0 * broad - 1.0, 0, 1)
+                rise = np.where(rising >= 1, 1.0, early)
                 may_fall = np.full(c.shape, k == count - 1) | (before <= z[k])
                 fall = np.where(may_fall, fall, (falling >= 1).astype(float))
             weight = rise * fall
@@ -110,8 +114,7 @@ def weights(coc: np.ndarray, alpha: np.ndarray, layers: np.ndarray, paper: bool)
                 if k > 0:
                     into = np.where(before <= z[k - 1], np.clip((c - z[k - 1]) / (z[k] - z[k - 1]), -np.inf, 1), 1.0)
                 if k > 0 and m == 0:
-                    around = max(1, round(widest))
-                    others = 1 - (1 - into) * breadth(c, around, z[k] - z[k - 1])
+                    others = 1 - (1 - into) * broad
                     is_own = (rising >= 1) & (falling >= 1) & (into < 1)
                     weight = np.where(is_own, np.where(others > 1e-3, into / np.maximum(others, 1e-3), 1.0), weight)
                 with np.errstate(divide="ignore", invalid="ignore"):
