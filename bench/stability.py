@@ -35,8 +35,9 @@ means that nothing was off by a single bit. Where bounds differ from method to m
 the method, explained where the test sets it and on the method's page.
 
 Variants: *iir* recursive filters throughout, *single* layers blurred one by one, *paper* as published, *atomic* views
-by atomic minima, *peels* rays through the peels themselves. A dash: not measured on that driver. The tests run in full
-on every driver; the stored record has all of PoCL, and of Intel's runtime about half of the cases.
+by atomic minima, *peels* rays through the peels themselves. A dash: not measured on that driver; one number alone: the
+same on all drivers of the table. The tests run in full on PoCL and Intel's runtime; rusticl, on which Mesa compiles for
+minutes, has methods without variants, and not of all families. `make test-devices ARGS=figures` measures both again.
 """
 
 
@@ -48,7 +49,7 @@ def table(rows: list[list]) -> str:
     for _, case, invariant, subject, driver, value, bound in rows:
         cells[case, invariant][subject][driver] = value
         bounds[case, invariant][subject] = max(bound, bounds[case, invariant].get(subject, bound))
-    lines = [f"Values: {', '.join(drivers)}, in that order.", "", "| case | invariant | worst seen | bound |"]
+    lines = [f"Values: {' / '.join(drivers)}.", "", "| case | invariant | worst seen | bound |"]
     lines.append("|---|---|---|---|")
     for (case, invariant), subjects in sorted(cells.items()):
         # Subjects that all of whose drivers measured nothing share a line.
@@ -57,7 +58,8 @@ def table(rows: list[list]) -> str:
             if not any(values.values()):
                 quiet.append(subject)
                 continue
-            shown = " / ".join(_number(values[driver]) if driver in values else "-" for driver in drivers)
+            numbers = [_number(values[driver]) if driver in values else "-" for driver in drivers]
+            shown = numbers[0] if len(set(numbers)) == 1 else " / ".join(numbers)
             parts.append(f"{subject} {shown}")
         if quiet:
             parts.append("0: " + (", ".join(quiet) if parts else "all"))

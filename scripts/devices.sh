@@ -97,7 +97,8 @@ for name in ${*:-two small gpu intel rusticl agree}; do
         if have_intel; then test_on figures-intel "${intel[@]}" "${record[@]}" -- tests/hard_cases
         else skip figures "no intel-opencl-rt to be had"; fi
         rm -f "$icd"/*
-        if have_rusticl; then test_on figures-rusticl "${rusticl[@]}" "${record[@]}" -- "${small[@]}"
+        if have_rusticl; then test_on figures-rusticl "${rusticl[@]}" "${record[@]}" -- tests/hard_cases \
+            -k "not random and not time" # an hour, most of it Mesa's compiler
         else skip figures "no mesa-opencl-icd to be had"; fi
         "$python" -m bench.stability
         ;;
