@@ -35,9 +35,10 @@ def main() -> int:
             parser.add_argument("--device", help="index, cpu, gpu or part of a name (as cldof render --device)")
             parser.add_argument("--busy", action="store_true", help="processor time in place of the clock")
             parser.add_argument("--scenes", nargs="+", default=auto.SCENES, help="of the built-in ones")
+            parser.add_argument("--size", type=int, default=auto.SIZE, help=f"pixels a side (default {auto.SIZE})")
             parser.add_argument("--output", metavar="FILE", help="keep every case as JSON")
             arguments = parser.parse_args(sys.argv[2:])
-            auto.report(arguments.device, arguments.busy, tuple(arguments.scenes), arguments.output)
+            auto.report(arguments.device, arguments.busy, tuple(arguments.scenes), arguments.output, arguments.size)
             return 0
         if sys.argv[1:2] == ["planned"]:
             parser = argparse.ArgumentParser(prog="bench planned", description="What planning is worth, by method.")

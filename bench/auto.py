@@ -1,10 +1,10 @@
 """How ``method="auto"`` keeps an error and a time: the tables of docs/auto.md.
 
-    python -m bench auto                # about five minutes on an idle 2-core machine
+    python -m bench auto                # some seven minutes on an idle 2-core machine, four with references on disk
     python -m bench auto --busy         # processor time in place of the clock, for a machine with other work
 
 Errors: 14 built-in scenes x 12 lenses (focus near, on the scene's subject and far; two apertures; disc and Gaussian) at
-192x192, each against its own accumulated reference. What is judged is never what was fitted: the measurements in
+256x256, each against its own accumulated reference. What is judged is never what was fitted: the measurements in
 bench/results/auto-tuning.json are of other lenses and sizes. There are two tables: with what `cldof tune` fits, and
 with models that for every scene are made anew from the other 13, as for a scene that nobody has measured. The device's
 times come from the run itself, always by a fit that leaves out the scene.
@@ -25,23 +25,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cldof import BudgetWarning, LayeredFrame, Lens, Renderer
-from cldof.auto import Budget, Chooser, Curves, Setting, features
+from cldof.auto import Budget, Chooser, Curves, Setting, cache_folder, features
 from cldof.capture.peel import DepthPeeler
 from cldof.capture.reference_cache import ReferenceCache
 from cldof.capture.scene import Scene
 from cldof.capture.scenes import builtin_scenes
 from cldof.lens import Aperture
-from cldof.metrics import psnr
 from cldof.tune import (
     LADDER,
     ErrorRow,
     TimeRow,
-    cache_folder,
     capture,
     copy_ms,
     fit_curves,
     fit_times,
     frame_ms,
+    judged_db,
     make_renderers,
     reference_for,
 )
@@ -51,7 +50,7 @@ SCENES = (
     "row", "fence", "foliage", "tabletop", "glass", "floating", "silhouettes", "branches", "plane", "lights", "sky",
     "near", "floor", "flat",
 )  # fmt: skip
-SIZE, LARGE = 192, 512
+SIZE, LARGE, LOOK = 256, 512, 192
 TARGETS_DB = (24, 26, 28, 30, 32, 34)
 BUDGETS_COPIES = (8, 12, 20, 40, 80)
 # A fixed setting meets a target when it does in this share of the cases.
@@ -91,7 +90,7 @@ def tuning_rows() -> list[ErrorRow]:
     return [ErrorRow(row["scene"], np.array(row["feature"]), np.array(row["db"])) for row in data["rows"]]
 
 
-def measured_cases(device: Any, busy: bool, scenes: tuple[str, ...]) -> Iterator[Case]:
+def measured_cases(device: Any, busy: bool, scenes: tuple[str, ...], size: int) -> Iterator[Case]:
     """Render everything once."""
     renderers = make_renderers(device)
     cache = ReferenceCache(cache_folder() / "references")
@@ -99,16 +98,14 @@ def measured_cases(device: Any, busy: bool, scenes: tuple[str, ...]) -> Iterator
         with DepthPeeler() as peeler:
             for name in scenes:
                 scene = builtin_scenes()[name].make()
-                camera = scene.camera_for(SIZE, SIZE)
-                look = peeler.peel(scene, camera, layers=2)
+                camera = scene.camera_for(size, size)
+                look = peeler.peel(scene, scene.camera_for(LOOK, LOOK), layers=2)
                 for lens in judged_lenses(scene, look):
-                    reference = reference_for(
-                        cache, peeler, scene, camera, lens, seed=1, noise_db=40.0, fewest=64, most=384
-                    )
+                    reference = reference_for(cache, peeler, scene, camera, lens, seed=1)
                     frame = capture(peeler, scene, camera, lens, look)
-                    ms = [frame_ms(renderer, frame, lens, 3, busy) for renderer in renderers]
-                    db = [min(50.0, psnr(renderer.render(frame, lens).image, reference)) for renderer in renderers]
-                    feature = features(renderers[0].stats(frame), lens, camera)
+                    ms = [frame_ms(renderer, frame, lens, 2, busy) for renderer in renderers]
+                    db = [judged_db(renderer.render(frame, lens).image, reference) for renderer in renderers]
+                    feature = features(renderers[0].stats(frame), lens, frame)
                     yield Case(name, lens.aperture.shape, feature, np.array(db), np.array(ms))
                 print(f"  {name}", flush=True)
     finally:
@@ -179,7 +176,7 @@ def judge_times(device: Any, busy: bool, unit_ms: float, scenes: tuple[str, ...]
         for name in scenes:
             scene = builtin_scenes()[name].make()
             camera = scene.camera_for(LARGE, LARGE)
-            look = peeler.peel(scene, scene.camera_for(SIZE, SIZE), layers=2)
+            look = peeler.peel(scene, scene.camera_for(LOOK, LOOK), layers=2)
             lens = judged_lenses(scene, look)[(2, 9)[len(shots) % 2]]
             shots.append((capture(peeler, scene, camera, lens, look), lens))
     quickest = [
@@ -219,12 +216,18 @@ def _time(renderer: Renderer, frame: LayeredFrame, lens: Lens, busy: bool) -> fl
         return frame_ms(renderer, frame, lens, 5, busy)
 
 
-def report(device: Any = None, busy: bool = False, scenes: tuple[str, ...] = SCENES, output: str | None = None) -> None:
+def report(
+    device: Any = None,
+    busy: bool = False,
+    scenes: tuple[str, ...] = SCENES,
+    output: str | None = None,
+    size: int = SIZE,
+) -> None:
     """Measure and print the tables."""
     with Renderer(device=device) as renderer:
         unit = copy_ms(renderer.device, busy)
         print(f"{renderer.device.info}, copy of 16 MB {unit:.3f} ms")
-    cases = list(measured_cases(device, busy, scenes))
+    cases = list(measured_cases(device, busy, scenes, size))
     if output:
         rows = [{"scene": c.scene, "shape": c.shape, "db": c.db.tolist(), "ms": c.ms.tolist()} for c in cases]
         Path(output).write_text(json.dumps({"settings": [str(one) for one in LADDER], "cases": rows}) + "\n")

@@ -1,9 +1,9 @@
 """``method="auto"``: the cheapest method and setting for an error, or the best for a time.
 
 What each setting costs and how far it errs is measured once per device by ``cldof tune`` (:mod:`cldof.tune`) over the
-built-in scenes and kept as :class:`Curves`: two linear models over :func:`features` of frame and lens, one for the
-error in dB, one for the logarithm of the time. A :class:`Chooser` picks by them, frame after frame, corrects its times
-by what it measures, and changes its mind only when it has to (docs/auto.md).
+built-in scenes and kept as :class:`Curves`: over :func:`features` of frame and lens a Gaussian process for the error in
+dB and a linear model for the logarithm of the time. A :class:`Chooser` picks by them, frame after frame, corrects its
+times by what it measures, and changes its mind only when it has to (docs/auto.md).
 
 Errors are RMS over pixels of linear RGB clipped to [0, 1], against what the lens's own aperture would show; in dB they
 are the PSNR of :func:`cldof.metrics.psnr`. A method that simulates another aperture counts with what that costs.
@@ -27,16 +27,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import Camera
 from .errors import BudgetWarning, InputError
+from .frame import LayeredFrame
 from .lens import Lens, checked_number
 from .planner import SceneStats
 
-__all__ = ["FEATURES", "TARGETS", "Auto", "Budget", "Choice", "Chooser", "Curves", "Setting", "features", "load_curves"]
+__all__ = [
+    "FEATURES",
+    "Auto",
+    "Budget",
+    "Choice",
+    "Chooser",
+    "Curves",
+    "ErrorModel",
+    "Setting",
+    "features",
+    "load_curves",
+]
 
-_FORMAT = 1
-TARGETS = np.arange(20.0, 51.0)
-"""PSNR in dB at which the share of cases is known that a setting is good enough for."""
+_FORMAT = 2
 Vector = NDArray[np.float64]
 
 
@@ -82,9 +91,10 @@ _FLOORS = {
     "luminance": 0.03,
     "near_coc": 0.5,
     "far_coc": 0.5,
+    "gloss": 0.1,
 }
 FEATURES = ("one", "is_disc", "pixels", "peels", *_FLOORS)
-"""What models are linear in; all but the first two are logarithms."""
+"""What models see of a frame; all but the first two are logarithms."""
 
 # CoC radii (px) from which on more of them changes an error no further.
 _FULL_TEXTURE_PX, _FULL_SILHOUETTE_PX = 4.0, 8.0
@@ -94,22 +104,21 @@ _STEP_PX, _SHARP_PX = 0.5, 0.5
 _BRIGHTEST = 30.0
 
 
-def features(stats: SceneStats, lens: Lens, camera: Camera) -> Vector:
+def features(stats: SceneStats, lens: Lens, frame: LayeredFrame) -> Vector:
     """A frame seen through a lens, in the numbers that errors and times depend on.
 
     Parameters
     ----------
     stats : SceneStats
-        Of the frame; per tile of 16 x 16 pixels.
+        Of the frame, or of one that looks like it; per tile of 16 x 16 pixels.
     lens : Lens
-    camera : Camera
-        The frame's.
+    frame : LayeredFrame
 
     Returns
     -------
     ndarray, (len(FEATURES),), float64
     """
-    c1, c0 = lens.coc_coefficients(camera)
+    c1, c0 = lens.coc_coefficients(frame.camera)
     has = stats.slots[:2] > 0.0
     with np.errstate(invalid="ignore"):
         near = np.where(has, c1 * stats.nearest[:2] + c0, 0.0)
@@ -152,6 +161,7 @@ def features(stats: SceneStats, lens: Lens, camera: Camera) -> Vector:
         "luminance": mean(stats.luminance[0]),
         "near_coc": max(0.0, -float(near.min())),
         "far_coc": max(0.0, float(far.max())),
+        "gloss": frame.lobe_turn_per_m * lens.aperture_radius_m if frame.is_glossy_through(lens) else 0.0,
     }
     is_disc = float(lens.aperture.shape != "gaussian")
     fixed = [1.0, is_disc, math.log10(stats.shape.height * stats.shape.width), math.log10(stats.shape.layers)]
@@ -252,7 +262,7 @@ class Choice:
     predicted_db : float
         PSNR expected against the lens's own aperture; half of all frames do better.
     uncertainty_db : float
-        Standard deviation of such predictions on scenes that they were not made from.
+        Standard deviation of this prediction: small near what was measured, large for what looks like none of it.
     meets_budget : bool
         Whether the prediction keeps the budget.
     reason : str
@@ -292,24 +302,74 @@ class Choice:
         }
 
 
+# Of the errors' model: variances of what is linear in the features and of the bells around cases, the bells' width in
+# standard deviations of features (root mean square), and the variance of what no feature tells. Chosen by what models
+# of all but one lens, and of all but one scene, say of those left out.
+_LINEAR, _BELL, _REACH, _NOISE = 0.3, 1.0, 0.4, 0.05
+
+
+class ErrorModel:
+    """PSNR of each setting, and how sure that is: a Gaussian process through what was measured.
+
+    Its kernel is linear in the features, for what holds in general, plus a bell around each case, for what holds near
+    that case (Rasmussen & Williams, Gaussian Processes for Machine Learning, 2006, algorithm 2.1). All settings share
+    it; how much each varies follows from its own measurements (maximum likelihood).
+
+    Parameters
+    ----------
+    feature : ndarray, (N, F)
+        Of the cases measured.
+    db : ndarray, (N, S)
+        What they had.
+    """
+
+    def __init__(self, feature: Vector, db: Vector) -> None:
+        self.feature, self.db = feature, db
+        self.low, self.high = feature.min(axis=0), feature.max(axis=0)
+        """Range of the features; beyond it, the ends hold."""
+        spread = feature.std(axis=0)
+        self._varies = spread > 1e-9
+        self._centre, self._spread = feature.mean(axis=0)[self._varies], spread[self._varies]
+        self._seen = self._scaled(feature)
+        inner = self._kernel(self._seen) + _NOISE * np.eye(len(feature))
+        self._inverse = np.linalg.inv(inner)
+        self._mean = db.mean(axis=0)
+        rest = db - self._mean
+        self._weights = self._inverse @ rest
+        self._amplitude = np.sqrt(np.maximum((rest * self._weights).mean(axis=0), 1e-6))
+
+    def predict(self, feature: Vector) -> tuple[Vector, Vector]:
+        """PSNR in dB expected of each setting for features (F,), and the standard deviation of that, (S,) each."""
+        at = self._scaled(feature[None])
+        near = self._kernel(at)[0]
+        own = _LINEAR * float((at * at).mean()) + _BELL if at.size else _BELL
+        variance = max(own - float(near @ self._inverse @ near), 0.0) + _NOISE
+        return self._mean + near @ self._weights, math.sqrt(variance) * self._amplitude
+
+    def _scaled(self, feature: Vector) -> Vector:
+        inside = np.clip(feature, self.low, self.high)[:, self._varies]
+        scaled: Vector = (inside - self._centre) / self._spread
+        return scaled
+
+    def _kernel(self, scaled: Vector) -> Vector:
+        """(K, N) between features and those measured."""
+        count = max(1, scaled.shape[1])
+        product = scaled @ self._seen.T / count
+        squares = (scaled**2).sum(axis=1)[:, None] / count + (self._seen**2).sum(axis=1) / count - 2.0 * product
+        kernel: Vector = _LINEAR * product + _BELL * np.exp(-0.5 * np.maximum(squares, 0.0) / _REACH**2)
+        return kernel
+
+
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Accuracy versus time of each setting on one device, as linear models over :data:`FEATURES`.
+    """Accuracy versus time of each setting on one device, over :data:`FEATURES`.
 
     Attributes
     ----------
     settings : tuple of Setting
-    error_db : ndarray, (F, S)
-        Weights: features @ error_db is the PSNR in dB.
+    errors : ErrorModel
     log_time : ndarray, (F, S)
         Weights: features @ log_time is the natural logarithm of the time in copies of 16 MB on the device.
-    low, high : ndarray, (F,)
-        Range of the features that errors were measured at; beyond it, the ends hold.
-    kept : mapping
-        By aperture, ``"gaussian"`` or ``"disc"``, (T, S): of the cases in which some setting reached the PSNR of
-        :data:`TARGETS`, the share in which each did.
-    uncertainty_db : ndarray, (S,)
-        RMS error of predictions for scenes that they were not made from.
     time_margin : ndarray, (S,)
         Logarithm of the factor over predictions that 95 % of times stay below, for frames that they were not made from.
     source : mapping
@@ -317,34 +377,17 @@ class Curves:
     """
 
     settings: tuple[Setting, ...]
-    error_db: Vector
+    errors: ErrorModel
     log_time: Vector
-    low: Vector
-    high: Vector
-    kept: Mapping[str, Vector]
-    uncertainty_db: Vector
     time_margin: Vector
     source: Mapping[str, Any]
 
-    def errors(self, feature: Vector) -> Vector:
-        """PSNR in dB expected of each setting, (S,)."""
-        predicted: Vector = np.clip(feature, self.low, self.high) @ self.error_db
-        return predicted
-
     def copies(self, feature: Vector) -> Vector:
         """Time expected of each setting in copies, (S,)."""
-        inside = np.clip(feature, self.low, self.high)
+        inside = np.clip(feature, self.errors.low, self.errors.high)
         inside[_SCALING] = feature[_SCALING]
         time: Vector = np.exp(np.clip(inside @ self.log_time, -10.0, 20.0))
         return time
-
-    def share_kept(self, feature: Vector, min_db: float) -> Vector:
-        """The share of tuning cases in which each setting reached a PSNR that some setting reached, (S,)."""
-        kept = self.kept["disc" if feature[FEATURES.index("is_disc")] else "gaussian"]
-        # Between two targets what holds for the higher one; beyond the last nothing is known.
-        row = int(np.searchsorted(TARGETS, min_db))
-        share: Vector = kept[row] if row < len(TARGETS) else np.zeros(kept.shape[1])
-        return share
 
     def to_json(self) -> str:
         """As :meth:`from_json` reads it."""
@@ -352,12 +395,9 @@ class Curves:
             "format": _FORMAT,
             "features": list(FEATURES),
             "settings": [{"method": one.method, "options": dict(one.options)} for one in self.settings],
-            "error_db": _rounded(self.error_db),
+            "measured_feature": _rounded(self.errors.feature),
+            "measured_db": _rounded(self.errors.db),
             "log_time": _rounded(self.log_time),
-            "low": _rounded(self.low),
-            "high": _rounded(self.high),
-            "kept": {shape: _rounded(share) for shape, share in self.kept.items()},
-            "uncertainty_db": _rounded(self.uncertainty_db),
             "time_margin": _rounded(self.time_margin),
             "source": dict(self.source),
         }
@@ -377,16 +417,18 @@ class Curves:
             if data["format"] != _FORMAT or tuple(data["features"]) != FEATURES:
                 raise InputError("The curves are of another version of cldof; run `cldof tune` again.")
             settings = tuple(Setting(str(one["method"]), dict(one["options"])) for one in data["settings"])
-            shape = (len(FEATURES), len(settings))
+            cases = len(data["measured_db"])
+            if cases < 2:
+                raise InputError(f"The curves hold {cases} measured cases; two are needed.")
+            model = ErrorModel(
+                _array(data["measured_feature"], (cases, len(FEATURES))),
+                _array(data["measured_db"], (cases, len(settings))),
+            )
             return cls(
                 settings,
-                _array(data["error_db"], shape),
-                _array(data["log_time"], shape),
-                _array(data["low"], shape[:1]),
-                _array(data["high"], shape[:1]),
-                {name: _array(data["kept"][name], (len(TARGETS), shape[1])) for name in ("gaussian", "disc")},
-                _array(data["uncertainty_db"], shape[1:]),
-                _array(data["time_margin"], shape[1:]),
+                model,
+                _array(data["log_time"], (len(FEATURES), len(settings))),
+                _array(data["time_margin"], (len(settings),)),
                 dict(data["source"]),
             )
         except InputError:
@@ -456,12 +498,10 @@ def curves_name(device: str, driver: str) -> str:
     return f"curves-{plain}-{key}.json"
 
 
-# Of the settings that kept an error in most tuning cases, those are trusted with it that kept it as often as the best
-# buy, where one case more in a hundred is worth 1.4 times the time; unless the prediction is this much too low.
-_WORTH, _LEAST_TRUSTED, _DISTRUST_DB = 100.0 * math.log(1.4), 0.92, 0.0
-# Others are taken when they are expected to do better by so many of their uncertainties: a cheaper one in place of a
-# trusted one, and any where none is trusted.
-_DOWNGRADE, _MARGIN = 1.5, 1.0
+# How sure it is to keep an error is weighed against time: certainty is worth so many times the quickest setting's time.
+_WORTH = 80.0
+# Where no setting is likelier than this to keep an error, the one that comes nearest is taken.
+_HOPELESS = 0.1
 # What a time has to hold: so much of the margin for a setting that has not run, less of it where another of its method
 # has, and this factor once it has run itself.
 _UNKNOWN, _RELATED, _KNOWN = 1.0, 0.5, 1.08
@@ -511,12 +551,12 @@ class Chooser:
         BudgetWarning
             No setting is expected to keep the budget: by how much. Once, until it changes.
         """
-        errors, times = self.curves.errors(feature), self._times(feature)
+        (errors, spread), times = self.curves.errors.predict(feature), self._times(feature)
         before = self._current
         if self._fading is not None and before is not None:  # one change at a time
             taken, reason = before, "kept from the frame before"
         else:
-            taken, reason = self._next(feature, errors, times)
+            taken, reason = self._next(errors, spread, times)
         if before is not None and taken != before:
             fits = self.budget.max_ms is None or times[taken] + times[before] <= self.budget.max_ms
             self._fading = (before, 0) if fits else None
@@ -531,7 +571,7 @@ class Chooser:
             self.curves.settings[taken],
             cost,
             float(errors[taken]),
-            float(self.curves.uncertainty_db[taken]),
+            float(spread[taken]),
             self._meets(taken, errors, times),
             reason,
             fades_from,
@@ -540,11 +580,11 @@ class Chooser:
         self._warn(taken, choice)
         return choice
 
-    def _next(self, feature: Vector, errors: Vector, times: Vector) -> tuple[int, str]:
+    def _next(self, errors: Vector, spread: Vector, times: Vector) -> tuple[int, str]:
         """The setting to take: another one when the one that runs fails, or when a gain has lasted."""
-        wished, reason = self._wish(feature, errors, times)
+        wished, reason = self._wish(errors, spread, times)
         current = self._current
-        if current is None or wished == current or not self._keeps(current, feature, errors, times):
+        if current is None or wished == current or not self._keeps(current, wished, errors, spread, times):
             self._wished_for = 0
             return wished, reason
         if self.budget.max_ms is None:
@@ -571,10 +611,14 @@ class Chooser:
             corrections[index] = known.get(index, sum(family) / len(family) if family else 0.0)
         return np.asarray(self.curves.copies(feature) * self.copy_ms * np.exp(corrections))
 
-    def _wish(self, feature: Vector, errors: Vector, times: Vector) -> tuple[int, str]:
+    def _wish(self, errors: Vector, spread: Vector, times: Vector) -> tuple[int, str]:
         if self.budget.max_ms is not None:
             return self._best_for_time(errors, times)
-        return self._cheapest_for_error(feature, errors, times)
+        chance = self._chances(errors, spread)
+        if chance.max() < _HOPELESS:
+            return _nearly_best(np.arange(len(errors)), errors, times), "the least error there is"
+        best = int(_prices(times, chance).argmin())
+        return best, f"{chance[best]:.0%} sure to keep the error, the most for the time"
 
     def _best_for_time(self, errors: Vector, times: Vector) -> tuple[int, str]:
         assert self.budget.max_ms is not None
@@ -583,22 +627,11 @@ class Chooser:
             return int(times.argmin()), "the quickest there is"
         return _nearly_best(fits, errors, times), f"the least error of {fits.size} settings that fit"
 
-    def _cheapest_for_error(self, feature: Vector, errors: Vector, times: Vector) -> tuple[int, str]:
-        target = self.budget.min_db
-        assert target is not None
-        trusted = self._trusted(feature, errors, times, _DISTRUST_DB)
-        spare = (_DOWNGRADE if trusted.any() else _MARGIN) * self.curves.uncertainty_db
-        good = np.flatnonzero(trusted | (errors >= target + spare))
-        if good.size:
-            return int(good[times[good].argmin()]), f"the cheapest of {good.size} settings for this error"
-        return _nearly_best(np.arange(len(errors)), errors, times), "the least error there is"
-
-    def _trusted(self, feature: Vector, errors: Vector, times: Vector, distrust_db: float) -> NDArray[np.bool_]:
-        target = self.budget.min_db
-        assert target is not None
-        kept = self.curves.share_kept(feature, target)
-        best_buy = kept[np.argmin(np.log(times) - _WORTH * kept)]
-        return np.asarray((kept >= max(best_buy, _LEAST_TRUSTED)) & (errors >= target - distrust_db))
+    def _chances(self, errors: Vector, spread: Vector, lenience_db: float = 0.0) -> Vector:
+        """How likely each setting is to keep the error."""
+        assert self.budget.min_db is not None
+        short = (self.budget.min_db - lenience_db - errors) / spread
+        return np.array([0.5 * math.erfc(each / math.sqrt(2.0)) for each in short])
 
     def _headroom(self) -> Vector:
         """Factors on expected times, for what the model does not know, (S,)."""
@@ -608,14 +641,15 @@ class Chooser:
         factors[list(self._ratios)] = _KNOWN
         return factors
 
-    def _keeps(self, index: int, feature: Vector, errors: Vector, times: Vector) -> bool:
+    def _keeps(self, index: int, wished: int, errors: Vector, spread: Vector, times: Vector) -> bool:
         """Whether a setting that runs may go on: the budget with less margin than a new one needs."""
         if self.budget.max_ms is not None:
             return bool(times[index] <= self.budget.max_ms)
-        assert self.budget.min_db is not None
-        is_trusted = self._trusted(feature, errors, times, _DISTRUST_DB + _LENIENCE_DB)[index]
-        spare = _MARGIN * self.curves.uncertainty_db[index]
-        return bool(is_trusted or errors[index] >= self.budget.min_db + spare - _LENIENCE_DB)
+        if times[wished] <= times[index]:
+            return True
+        prices = _prices(times, self._chances(errors, spread))
+        lenient = _prices(times, self._chances(errors, spread, _LENIENCE_DB))
+        return bool(lenient[index] <= prices[wished])
 
     def _meets(self, index: int, errors: Vector, times: Vector) -> bool:
         if self.budget.max_ms is not None:
@@ -642,6 +676,12 @@ class Chooser:
                 f"to miss it by {self.budget.min_db - choice.predicted_db:.1f} dB ({choice.predicted_db:.1f} dB)"
             )
         warnings.warn(f"{what}.", BudgetWarning, stacklevel=4)
+
+
+def _prices(times: Vector, chances: Vector) -> Vector:
+    """What settings cost, what they may miss included, in times of the quickest."""
+    prices: Vector = times / times.min() - _WORTH * chances
+    return prices
 
 
 def _nearly_best(among: NDArray[np.intp], errors: Vector, times: Vector) -> int:

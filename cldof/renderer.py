@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .auto import Auto, Budget, Choice, Chooser, Setting, features, load_curves
-from .camera import Camera
 from .errors import CldofError, DeviceError, InputError
 from .frame import LayeredFrame
 from .host.buffers import BufferPool, HostInput
@@ -145,13 +144,13 @@ class _Automatic:
         self._lock = threading.Lock()  # results may be asked for by other threads than frames
         self.under_way = 0
 
-    def choose(self, stats: SceneStats, lens: Lens, camera: Camera) -> tuple[Choice, NDArray[np.float64]]:
+    def choose(self, stats: SceneStats, lens: Lens, frame: LayeredFrame) -> tuple[Choice, NDArray[np.float64]]:
         with self._lock:
             if self._chooser is None:
                 info = self._device.info
                 curves = load_curves(info.name, info.driver_version)
                 self._chooser = Chooser(curves, self._budget, copy_baseline(self._device, runs=12).min_ms)
-            feature = features(stats, lens, camera)
+            feature = features(stats, lens, frame)
             return self._chooser.choose(feature), feature
 
     def method(self, setting: Setting) -> Method:
@@ -367,7 +366,7 @@ class Renderer:
                 return self._start(held, lens, self.method, image, started)[0]
             assert held.stats is not None
             is_alone = self._automatic.under_way == 0
-            choice, feature = self._automatic.choose(self._known(held)[0], lens, frame.camera)
+            choice, feature = self._automatic.choose(self._known(held)[0], lens, frame)
             faded = None
             if choice.fades_from is not None:
                 before = self._automatic.method(choice.fades_from)

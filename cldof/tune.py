@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .auto import FEATURES, TARGETS, Curves, Setting, cache_folder, curves_name, features, shipped_curves
+from .auto import FEATURES, Curves, ErrorModel, Setting, cache_folder, curves_name, features, shipped_curves
 from .camera import Camera
 from .errors import InputError
 from .files import atomic_write
@@ -32,6 +32,7 @@ from .metrics import psnr
 from .renderer import Renderer
 
 if TYPE_CHECKING:
+    from .capture.accumulate import Reference
     from .capture.peel import DepthPeeler
     from .capture.reference_cache import ReferenceCache
     from .capture.scene import Scene
@@ -63,16 +64,16 @@ LADDER = (
     Setting("multiview", {"rays": 16}),
     Setting("multiview", {"rays": 32}),
     Setting("multiview", {"rays": 64}),
-    Setting("multiview", {"rays": 128}),
-    Setting("multiview", {"rays": 256}),
+    Setting("multiview", {"rays": 256, "centred": True}),
+    Setting("lightfield", {"views": 24}),
+    Setting("lightfield", {"views": 64}),
+    Setting("lightfield", {"views": 160}),
 )
-"""What ``method="auto"`` chooses from. The light field is not among them: where it was measured, rays were as good for
-less than half of the time."""
+"""What ``method="auto"`` chooses from."""
 
 # Beyond this PSNR an image is as good as its reference.
 _BEST_DB = 50.0
-# Strength of the ridge: with 14 scenes, models that fit them more closely say less about any other scene.
-_RIDGE = 30.0
+# Strength of the ridge, and runs of rows that are left out in turn.
 _TIME_RIDGE, _TIME_PARTS = 3.0, 14
 # Features that times depend on; the others describe what is seen, not what is computed.
 _TIME_FEATURES = (
@@ -80,13 +81,15 @@ _TIME_FEATURES = (
 )  # fmt: skip
 
 # Image sizes and lenses per scene: errors at small sizes, where references are quick, times also at a large one.
-_ERROR_SIZES, _LENSES = (128, 256), 8
+_ERROR_SIZES, _LENSES = (160, 320), 12
 _TIME_SIZES = (192, 384, 640)
 _PEELS = 4
-# A reference is drawn with more views until its own noise lies below this.
-_NOISE_DB, _FEWEST_VIEWS, _MOST_VIEWS = 44.0, 96, 1024
-_GUARD_SHARE = 0.10
-_RUNS = 4
+# A reference is drawn with more views until its own noise, which is known and taken off, lies below this.
+_NOISE_DB, _FEWEST_VIEWS, _MOST_VIEWS = 38.0, 48, 512
+_GUARD_SHARE, _GUARD_STEP_PX = 0.10, 8
+# Scenes in which lens points see other highlights; users of such scenes capture surface buffers.
+_MIRRORING = ("floor", "mirrors")
+_RUNS = 3
 
 
 @dataclass(frozen=True)
@@ -170,37 +173,43 @@ def capture(
     """A frame with a guard band for the lens's largest blur, up to a tenth of the image."""
     c1, c0 = lens.coc_coefficients(camera)
     largest = max(abs(c1 * inverse + c0) for inverse in look.inverse_depth_range)
-    guard = min(math.ceil(largest), math.ceil(_GUARD_SHARE * max(camera.width, camera.height)))
-    return peeler.peel(scene, camera, layers=peels, lens=lens, guard_px=guard)
+    # Few different widths: OpenCL programs are compiled for each.
+    wanted = min(largest, _GUARD_SHARE * max(camera.width, camera.height))
+    guard = math.ceil(wanted / _GUARD_STEP_PX) * _GUARD_STEP_PX
+    surface = scene.name in _MIRRORING
+    return peeler.peel(scene, camera, layers=peels, lens=lens, guard_px=guard, surface=surface)
 
 
 def reference_for(
-    cache: ReferenceCache,
-    peeler: DepthPeeler,
-    scene: Scene,
-    camera: Camera,
-    lens: Lens,
-    seed: int = 0,
-    noise_db: float | None = None,
-    fewest: int | None = None,
-    most: int | None = None,
-) -> NDArray[np.float32]:
+    cache: ReferenceCache, peeler: DepthPeeler, scene: Scene, camera: Camera, lens: Lens, seed: int = 0
+) -> Reference:
     """An accumulated image whose own noise is below what is to be measured, as far as so many views can."""
-    views, most = fewest or _FEWEST_VIEWS, most or _MOST_VIEWS
-    limit = math.pow(10.0, -(_NOISE_DB if noise_db is None else noise_db) / 20.0)
+    views = _FEWEST_VIEWS
+    limit = math.pow(10.0, -_NOISE_DB / 20.0)
     while True:
         made = cache.accumulate(peeler, scene, camera, lens, views, seed=seed)
         noise = made.noise_rms or 0.0
-        if views >= most or noise <= limit:
-            return made.image
+        if views >= _MOST_VIEWS or noise <= limit:
+            return made
         # Noise falls with views ** -0.75.
         needed = views * (noise / limit) ** (1.0 / 0.75)
-        views = min(most, max(math.ceil(1.5 * views), math.ceil(needed)))
+        views = min(_MOST_VIEWS, max(math.ceil(1.5 * views), math.ceil(needed)))
+
+
+def judged_db(image: NDArray[np.float32], reference: Reference) -> float:
+    """PSNR against what the reference would be without its noise.
+
+    The noise of its lens points is independent of what a method does wrong, so that mean squares add. What remains is
+    taken to be a quarter of the noise at least.
+    """
+    noise = (reference.noise_rms or 0.0) ** 2
+    square = math.pow(10.0, -psnr(image, reference.image) / 10.0)
+    return min(_BEST_DB, -10.0 * math.log10(max(square - noise, noise / 4.0, 1e-9)))
 
 
 def measure_errors(
     renderers: Sequence[Renderer],
-    cases: Iterable[tuple[str, LayeredFrame, Lens, NDArray[np.float32]]],
+    cases: Iterable[tuple[str, LayeredFrame, Lens, Reference]],
 ) -> Iterator[ErrorRow]:
     """How far each setting errs.
 
@@ -211,8 +220,8 @@ def measure_errors(
     cases : iterable of (scene, frame, lens, reference)
     """
     for scene, frame, lens, reference in cases:
-        db = [min(_BEST_DB, psnr(renderer.render(frame, lens).image, reference)) for renderer in renderers]
-        yield ErrorRow(scene, features(renderers[0].stats(frame), lens, frame.camera), np.array(db))
+        db = [judged_db(renderer.render(frame, lens).image, reference) for renderer in renderers]
+        yield ErrorRow(scene, features(renderers[0].stats(frame), lens, frame), np.array(db))
 
 
 def measure_times(
@@ -224,7 +233,7 @@ def measure_times(
     """
     for frame, lens in cases:
         times = [frame_ms(renderer, frame, lens, busy=busy) for renderer in renderers]
-        feature = features(renderers[0].stats(frame), lens, frame.camera)
+        feature = features(renderers[0].stats(frame), lens, frame)
         yield TimeRow(feature, np.array(times) / copy_ms)
 
 
@@ -254,35 +263,8 @@ def copy_ms(device: Device, busy: bool = False) -> float:
 
 def fit_curves(errors: Sequence[ErrorRow], times: Sequence[TimeRow], source: dict[str, Any]) -> Curves:
     """Models of error and time over the features, from measurements."""
-    feature, db = np.array([row.feature for row in errors]), np.array([row.db for row in errors])
-    scenes = np.array([row.scene for row in errors])
-    left_out = np.zeros_like(db)
-    for scene in sorted(set(scenes)) if len(set(scenes)) > 1 else []:
-        known = scenes != scene
-        left_out[~known] = feature[~known] @ _ridge(feature[known], db[known], _RIDGE)
-    is_disc = feature[:, FEATURES.index("is_disc")] > 0.5
-    log_time, margin = fit_times(times)
-    return Curves(
-        LADDER,
-        _ridge(feature, db, _RIDGE),
-        log_time,
-        feature.min(axis=0),
-        feature.max(axis=0),
-        {"disc": _kept(db[is_disc]), "gaussian": _kept(db[~is_disc])},
-        np.sqrt(np.mean((db - left_out) ** 2, axis=0)),
-        margin,
-        source,
-    )
-
-
-def _kept(db: Vector) -> Vector:
-    """See :attr:`cldof.auto.Curves.kept`."""
-    shares = np.zeros((len(TARGETS), db.shape[1]))
-    for row, target in enumerate(TARGETS):
-        reached = (db >= target).any(axis=1)
-        if reached.any():
-            shares[row] = (db[reached] >= target).mean(axis=0)
-    return shares
+    model = ErrorModel(np.array([row.feature for row in errors]), np.array([row.db for row in errors]))
+    return Curves(LADDER, model, *fit_times(times), source)
 
 
 def fit_times(rows: Sequence[TimeRow]) -> tuple[Vector, Vector]:
@@ -352,7 +334,7 @@ def make_renderers(device: int | str | None) -> list[Renderer]:
     made: list[Renderer] = []
     try:
         for setting in LADDER:
-            made.append(Renderer(setting.method, device=device, **setting.options))
+            made.append(Renderer(setting.method, device=device, frames_in_flight=1, **setting.options))
     except BaseException:
         for renderer in made:
             renderer.close()
