@@ -76,12 +76,12 @@ def _blurred(device: Device) -> np.ndarray:
 
 
 def _mostly_sharp() -> LayeredFrame:
-    """In focus but for a corner, so that the planner works in windows."""
-    depth = np.full((1, 96, 128), 2.0, np.float32)
-    depth[:, :20, :20] = 9.0
-    color = np.random.default_rng(1).random((1, 96, 128, 4)).astype(np.float32)
+    """In focus but for a corner, so that the planner works in windows; with rows that end before their pitch."""
+    depth = np.full((1, 96, 126), 2.0, np.float32)
+    depth[:, :20, -20:] = 9.0
+    color = np.random.default_rng(1).random((1, 96, 126, 4)).astype(np.float32)
     color[..., 3] = 1.0
-    return LayeredFrame(color, depth, Camera(128, 96, 40.0))
+    return LayeredFrame(color, depth, Camera(126, 96, 40.0))
 
 
 FRAMES: dict[str, Callable[[], LayeredFrame]] = {

@@ -72,6 +72,7 @@
 #define SIMILAR_SHARE 0.125f /* ... and this share of the CoC */
 #define OPAQUE_ALPHA 0.999f  /* as cldof.frame has it: less is glass */
 #define MAX_COC_PX 1048576.0f
+#define EDGE_PX 0.03125f     /* so near to an edge of the layers a ray is beyond it: more than positions are rounded by */
 #define TILE 8               /* pixels each way, for culling */
 #define CULL_RINGS 6         /* tiles round a tile that may hide it: CoC up to 45 px apart */
 #define SEGMENT 32           /* pixels of a row that one item of lightfield_synthesize makes */
@@ -391,8 +392,10 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
 #if LIGHTFIELD_VOID
             if (depth > 0.0f && is_clear(color + ((size_t)line * size.width + x) * 4)) continue;
 #endif
-            /* The void behind a surface is the same for every peel. */
-            if (m > 0 && depth == 0.0f && inv_depth[row - peel + x] == 0.0f) continue;
+            /* The void behind a surface is the same for every peel; what is behind glass at infinity is not void. */
+            if (m > 0 && depth == 0.0f && inv_depth[row - peel + x] == 0.0f
+                && !(LIGHTFIELD_GLASS && is_glass(color, size, m - 1, x, y)))
+                continue;
             const float coc = ((const float *)&c)[i];
             const size_t to = row + count++;
             slot_at[to] = (uint)(row + x);
@@ -864,13 +867,41 @@ static inline void mirrored(float4 found[16], const uint2 hits[16], int end, int
 }
 #endif
 
+/* Whether a ray that is at (x, y) in focus, in px, and hits inverse depth w has come in over an edge of the layers on
+ * its way, behind an opaque surface that the layers end in there. That surface goes on outside, nobody knows how far, and what
+ * is behind it was not to be seen: the ray says nothing, as where a view has a hole. Without a guard band that is what
+ * surfaces that have moved off an edge leave there. */
+static inline int is_beyond(const __global float *color, const __global float *inv_depth, LightfieldSize size,
+                            LightfieldLens lens, float x, float y, float v_x, float v_y, float w, float c)
+{
+    const float hit_x = x - c * v_x, hit_y = y - c * v_y;
+    const float to_x = -lens.c1 * v_x, to_y = -lens.c1 * v_y; /* px per 1/m towards the lens */
+    const float room_x = to_x < 0.0f ? hit_x + 0.5f - EDGE_PX : (float)size.width - 0.5f - EDGE_PX - hit_x;
+    const float room_y = to_y < 0.0f ? hit_y + 0.5f - EDGE_PX : (float)size.height - 0.5f - EDGE_PX - hit_y;
+    const float speed_x = absolute(to_x), speed_y = absolute(to_y);
+    const float in_x = speed_x > 1e-12f ? room_x / speed_x : MAXFLOAT;
+    const float in_y = speed_y > 1e-12f ? room_y / speed_y : MAXFLOAT;
+    float t = in_x < in_y ? in_x : in_y;
+    t = t < 0.0f ? 0.0f : t;
+    if (!(t < 1e12f)) return 0;
+    const int at_x = clamp_index((int)(hit_x + t * to_x + 0.5f), size.width - 1);
+    const int at_y = clamp_index((int)(hit_y + t * to_y + 0.5f), size.height - 1);
+    for (int m = 0; m < size.peels; m++) {
+        const size_t row = (size_t)m * size.height + at_y;
+        if (inv_depth[row * size.pitch + at_x] > w + t && color[(row * size.width + at_x) * 4 + 3] >= OPAQUE_ALPHA)
+            return 1;
+    }
+    return 0;
+}
+
 /* Colours of sixteen rays of a view, side by side, from their winners; `end` of them count. (left, top) is the first
  * one's place in the reference view in 1/256 px. Holes are left as they are. False if all are holes. */
 static inline int ray_colors(float4 found[16], uint2 hits[16], const __global uint2 *winners, int end,
                              const __global float *color, const __global float *inv_depth,
                              const __global uchar *cells, LightfieldSize size, LightfieldLens lens, int left, int top,
-                             float shift_x, float shift_y, uint seed MIP_PARAMS SHADE_PARAMS)
+                             LightfieldView v, uint seed MIP_PARAMS SHADE_PARAMS)
 {
+    const float shift_x = SUB * v.x, shift_y = SUB * v.y;
     /* Addresses of all at once, colours one by one. */
     uint any = 0;
     int16 key, at;
@@ -896,6 +927,19 @@ static inline int ray_colors(float4 found[16], uint2 hits[16], const __global ui
     const int16 ray_x = left + (LANES << 8) - convert_int16(c * shift_x);
     const int16 ray_y = top - convert_int16(c * shift_y);
     const int16 cell_x = ray_x >> 8, cell_y = ray_y >> 8;
+    if ((left >> 8) < lens.reach || (left >> 8) + end + lens.reach > size.width || (top >> 8) < lens.reach
+        || (top >> 8) + 1 + lens.reach > size.height) {
+        any = 0;
+        for (int i = 0; i < end; i++) {
+            if (hits[i].x != NONE
+                && is_beyond(color, inv_depth, size, lens, ((float)(left + (i << 8)) - v.z) * (1.0f / SUB),
+                             ((float)top - v.w) * (1.0f / SUB), v.x, v.y, ((const float *)&w)[i],
+                             ((const float *)&c)[i]))
+                hits[i] = (uint2)(NONE);
+            any |= hits[i].x ^ NONE;
+        }
+        if (!any) return 0;
+    }
     int16 peel_at = 0, color_at = 0;
     for (int m = 1; m < size.peels; m++) {
         const int16 is_behind = at >= m * peel;
@@ -1001,7 +1045,6 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
         const float weight = 1.0f / (tangent * tangent);
         const __global uint2 *own = winners + (size_t)s * size.planes * plane_size + here;
         const uint seed = ((uint)(first_view + s) << 24 ^ (uint)y << 12) + (uint)x0;
-        const float shift_x = SUB * v.x, shift_y = SUB * v.y;
 #if LIGHTFIELD_SHADED
         const float4 eye = shading_eye(lighting, v.x * lens.radius, -v.y * lens.radius);
 #endif
@@ -1012,7 +1055,7 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
             uint2 hits[16];
 #define RAYS_OF(colors, winners_of, plane)                                                                            \
     ray_colors(colors, winners_of, own + (plane) * plane_size + b, end, color, inv_depth, cells, size, lens,          \
-               left + (b << 8), top, shift_x, shift_y, seed + b MIP_ARGS SHADE_ARGS)
+               left + (b << 8), top, v, seed + b MIP_ARGS SHADE_ARGS)
 #if LIGHTFIELD_GLASS
             /* Rays that meet glass before what hides the rest: the panes over one another, then what is behind. A hole
              * behind glass counts as far as the glass covers it; or, if the frame lets the void through, as the void:

@@ -51,9 +51,7 @@ class Subject:
         self.method, self.options = SUBJECTS[name]
         self.renderer = Renderer(self.method, device=info.index, **self.options)
         renderers = [self.renderer]
-        # Variants differ in what a plan does not touch. Behind frames without a guard band the light field sees peels
-        # that its plan has left out.
-        if name in METHODS and name != "lightfield" and not self.is_slow:
+        if name in METHODS and not self.is_slow:
             renderers.append(Renderer(self.method, device=info.index, planned=False))
         self._unplanned = renderers[1] if len(renderers) > 1 else None
         self.shown: np.ndarray | None = None
@@ -90,7 +88,9 @@ class Subject:
         result = self.renderer.render(frame, lens)
         image = _finite(self.name, result.image)
         self.shown, self.full = image, None
-        if self._unplanned is not None and not planned_only:
+        # The light field keeps two panes of a column apart, and the pinhole that a plan puts in its place all of them.
+        is_exact = self.method != "lightfield" or frame.panes <= 2
+        if self._unplanned is not None and is_exact and not planned_only:
             self.full = _finite(f"{self.name} unplanned", self._unplanned.render(frame, lens).image)
             # A column that lets less than a tolerance through may come out closed without a plan, unlike the pinhole.
             pinhole = frame.pinhole_image()

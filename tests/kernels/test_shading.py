@@ -55,6 +55,21 @@ def test_surfaces_become_planes(device: Device) -> None:
     assert (planes[:, 3:6, :, 37:] == 0.0).all()
 
 
+def test_the_length_of_a_normal_does_not_matter(device: Device) -> None:
+    """Captures interpolate normals, and callers may hand in any: planes hold unit ones, and light is the same."""
+    frame = shaded_frame(37, 21)
+    lengths = np.random.default_rng(3).uniform(0.25, 4.0, frame.depth.shape).astype(np.float32)
+    surface = {name: frame.surface[name] for name in ("specular", "shininess", "albedo") if name in frame.surface}
+    scaled = LayeredFrame(
+        frame.color, frame.depth, frame.camera, normal=frame.surface["normal"] * lengths[..., None],
+        lighting=frame.lighting, **surface,
+    )  # fmt: skip
+    planes = matte_of(device, scaled, "surface")[:, :3, :, :37]
+    norms = np.linalg.norm(frame.surface["normal"], axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(planes, axis=1)[norms > 0], 1.0, atol=1e-6)
+    np.testing.assert_allclose(matte_of(device, scaled), matte_of(device, frame), atol=5e-3)
+
+
 def test_what_mirrors_nothing_keeps_its_bits(device: Device) -> None:
     frame = shaded_frame(37, 21)
     still = (frame.surface["specular"] == 0.0).all(-1)

@@ -144,9 +144,9 @@ def slots(
     c = coc(inv_depth, c1, c0)
     all_edges = edges(inv_depth, c) if support == "surface" else np.zeros((*c.shape, 4), int)
     m, y, x = np.nonzero(inv_depth >= 0)
-    again = (m > 0) & (inv_depth[m, y, x] == 0) & (inv_depth[m - 1, y, x] == 0)
-    m, y, x = m[~again], y[~again], x[~again]
     glass = (alpha > 0) & (alpha < OPAQUE)
+    again = (m > 0) & (inv_depth[m, y, x] == 0) & (inv_depth[m - 1, y, x] == 0) & ~(glass[m - 1, y, x] & (planes > 1))
+    m, y, x = m[~again], y[~again], x[~again]
     rank = np.minimum(np.cumsum(glass[::-1], axis=0)[::-1], planes - 1)
     plane = np.where(glass & (planes > 1), rank, 0)
     return Slots(
@@ -250,6 +250,25 @@ def _hits(
     return Hits(m, y, x, w, c, ray_x, ray_y)
 
 
+def beyond(inv_depth: np.ndarray, hits: Hits, view: np.ndarray, c1: float, guard: int) -> np.ndarray:
+    """Rays that came in over an edge of the layers behind a surface that ends there; as ``is_beyond``."""
+    _, rows, columns = inv_depth.shape
+    gy, gx = np.mgrid[: hits.inv_depth.shape[0], : hits.inv_depth.shape[1]].astype(float)
+    time = np.full(hits.inv_depth.shape, np.inf)
+    places = []
+    for axis, middle, count in ((0, gx + guard, columns), (1, gy + guard, rows)):
+        v = float(view[axis])
+        hit, speed = middle - float(view[2 + axis]) / 256.0 - hits.coc * v, -c1 * v
+        # The distance to the edge that lies towards the lens.
+        room = hit + 0.5 if speed < 0 else count - 0.5 - hit
+        if abs(speed) > 1e-12:
+            time = np.minimum(time, np.maximum((room - 1.0 / 32.0) / abs(speed), 0.0))
+        places.append((hit, speed, count))
+    leaves = np.where(time < 1e12, time, 0.0)
+    x, y = (np.clip(np.trunc(hit + leaves * speed + 0.5).astype(int), 0, n - 1) for hit, speed, n in places)
+    return (time < 1e12) & (inv_depth[:, y, x] > hits.inv_depth + leaves).any(axis=0)
+
+
 def _look_up(
     color: np.ndarray, inv_depth: np.ndarray, winner: np.ndarray, view: np.ndarray, c1: float, c0: float,
     pitch: int, guard: int, lookup: str, glass: bool,
@@ -296,6 +315,10 @@ def render(
     With ``mirrored`` rays look up ``matte`` and add what is mirrored where they hit, (H, W, 3), towards a view.
     """
 
+    def seen_by(winner: np.ndarray, view: np.ndarray) -> np.ndarray:
+        hits = _hits(inv_depth, winner, view, c1, c0, pitch, guard)
+        return (winner & np.uint64(NONE) != NONE) & ~beyond(opaque_depth, hits, view, c1, guard)
+
     def rays(winner: np.ndarray, view: np.ndarray) -> np.ndarray:
         looked_at = color if matte is None else matte
         found = _look_up(looked_at, inv_depth, winner, view, c1, c0, pitch, guard, lookup, glass)
@@ -305,6 +328,7 @@ def render(
         return found
 
     alpha = color[..., 3].astype(np.float32)
+    opaque_depth = np.where(alpha >= OPAQUE, inv_depth, -1.0)
     planes = 1 + int(((alpha > 0) & (alpha < OPAQUE)).sum(axis=0).max()) if glass else 1
     size = (color.shape[1] - 2 * guard, color.shape[2] - 2 * guard)
     color = color.astype(np.float64)
@@ -314,12 +338,13 @@ def render(
         weight = 1.0 / (1.0 + cos4 * (float(view[0]) ** 2 + float(view[1]) ** 2)) ** 2
         winners = warp(some, view, size, planes, guard, support)
         solid = winners[0]
+        has_hit = seen_by(solid, view)
         image = np.zeros((*size, 4))
         for winner in np.sort(winners[1:], axis=0):
-            there = (winner & np.uint64(NONE) != NONE) & (winner < solid)
+            there = seen_by(winner, view) & (winner < np.where(has_hit, solid, np.uint64(2**64 - 1)))
             found = rays(winner, view)
             image += np.where(there[..., None], (1.0 - image[..., 3:]) * found, 0.0)
-        there = solid & np.uint64(NONE) != NONE
+        there = has_hit
         found = rays(solid, view)
         image += np.where(there[..., None], (1.0 - image[..., 3:]) * found, 0.0)
         total += weight * image

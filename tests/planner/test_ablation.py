@@ -13,6 +13,7 @@ from tests.planner.scenes import Box, lens_for, wall_frame
 WINDOW_CASES: dict[str, tuple[list[Box], float, int]] = {
     "near box": ([(100, 90, 150, 130, 1.0)], 4.0, 1),
     "hole": ([(100, 90, 150, 130, 9.0)], 6.0, 1),
+    "hole of whole tiles": ([(112, 80, 160, 144, 9.0)], 6.0, 1),
     "at the edge": ([(0, 0, 40, 60, 1.2)], 5.0, 1),
     "in the corner": ([(300, 200, 333, 222, 1.3)], 5.0, 1),
     "two": ([(0, 0, 16, 16, 1.3), (310, 200, 333, 222, 5.0)], 2.0, 2),
@@ -34,7 +35,7 @@ def test_windows(pair: Pair, case: str) -> None:
 
 @pytest.mark.parametrize("opaque", [True, False])
 def test_windows_of_guard_bands_and_odd_sizes(pair: Pair, opaque: bool) -> None:
-    inner = wall_frame(301, 203, [(120, 80, 150, 110, 1.1), (20, 20, 30, 60, 9.0)], opaque=opaque)
+    inner = wall_frame(301, 203, [(120, 80, 150, 110, 1.1), (250, 20, 301, 60, 9.0)], opaque=opaque)
     guard = 21
     camera = inner.camera.__class__(301 - 2 * guard, 203 - 2 * guard, 40.0)
     frame = LayeredFrame(inner.color, inner.depth, camera, guard_px=guard)
@@ -62,8 +63,11 @@ def test_a_plain_wall_out_of_focus_needs_no_blur(pair: Pair) -> None:
 @pytest.mark.parametrize("opaque", [True, False])
 @pytest.mark.parametrize("layers", [1, 4])
 def test_glass_is_left_as_it_is_to_the_bit(pair: Pair, layers: int, opaque: bool) -> None:
-    """What a pinhole sees of panes behind panes is what numpy computes."""
+    """What a pinhole sees of panes behind panes is what numpy computes, however little they let through."""
     frame = noise_frame(61, 43, layers, seed=layers, opaque=opaque)
+    thick = np.random.default_rng(layers).uniform(0.5, 1.0, frame.color.shape[:3]).astype(np.float32)
+    thick[-1] = 1.0
+    frame = LayeredFrame(frame.color * thick[..., None], frame.depth, frame.camera)
     result = pair[0].render(frame, Lens(0.0, 1.0))
     assert result.plan.structure.windows == ()
     np.testing.assert_array_equal(result.image, frame.pinhole_image())

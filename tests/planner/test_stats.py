@@ -32,6 +32,20 @@ def test_tiles(device: Device, size: tuple[int, int], opaque: bool) -> None:
     assert stats.shape == FrameShape.of(frame)
 
 
+@pytest.mark.parametrize("across", [False, True])
+def test_steps_from_tile_to_tile_count_for_the_first(device: Device, across: bool) -> None:
+    """Depth changes between the last pixel of a tile and the only one of the next, and nowhere else."""
+    depth = np.full((17, 33), 2.0, np.float32)
+    depth[16] = 4.0
+    depth = np.ascontiguousarray(depth.T) if across else depth
+    height, width = depth.shape
+    stats = frame_stats(
+        device, LayeredFrame(np.ones((height, width, 4), np.float32), depth, Camera(width, height, 40.0))
+    )
+    step = stats.step[0].T if across else stats.step[0]
+    np.testing.assert_array_equal(step, [[0.25, 0.25, 0.25], [0.0, 0.0, 0.0]])
+
+
 def test_the_histogram_counts_what_is_there(device: Device) -> None:
     frame = noise_frame(200, 150, layers=2, seed=5)
     stats = frame_stats(device, frame)
@@ -42,6 +56,24 @@ def test_the_histogram_counts_what_is_there(device: Device) -> None:
         share = stats.histogram[peel] / exact.sum()
         assert abs(share.sum() - 1.0) < 0.05
         assert np.abs(np.cumsum(share) - np.cumsum(exact) / exact.sum()).max() < 0.08
+
+
+@pytest.mark.parametrize("opaque", [True, False])
+def test_the_histogram_takes_one_row_in_sixteen(device: Device, opaque: bool) -> None:
+    """Row 5 t modulo 16 of the t-th sixteen, or the last there is, for all of them; void is no slot."""
+    frame = noise_frame(61, 75, layers=2, seed=5, opaque=opaque)
+    first, last = frame.inverse_depth_range
+    expected = np.zeros((2, BINS))
+    for top in range(0, 75, 16):
+        y = min(top + 5 * (top // 16) % 16, 74)
+        for peel in range(2):
+            there = frame.color[peel, y, :, 3] > 0
+            counted, _ = np.histogram(1.0 / frame.depth[peel, y][there], BINS, (first, last))
+            expected[peel] += counted * min(16, 75 - top)
+    found = frame_stats(device, frame).histogram
+    np.testing.assert_allclose(found.sum(axis=1), expected.sum(axis=1))
+    # A slot at the edge of a bin may fall into the next one.
+    assert np.abs(np.cumsum(found - expected, axis=1)).max() <= 16
 
 
 def test_shares_of_blur(device: Device) -> None:
