@@ -6,8 +6,9 @@
  * 16 pixels of a run move by the same whole number of pixels: the way of 16 rays through a layer is one contiguous,
  * unaligned load. Gathers, which CPUs are slow at, do not occur.
  *
- * Layer s holds the C between its bounds and is met in its middle, or at the mean C of what it holds. Layers are
- * float[height][pitch][4], premultiplied; alpha is how much of the pixel, or of the cone around it, the layer blocks.
+ * Layer s holds the inverse depths between its bounds and is met in its middle, or at the mean C of what it holds. Its
+ * bounds stand still in the scene while the focus moves, so that all that it holds is blurred more or less evenly. Layers
+ * are float[height][pitch][4], premultiplied; alpha is how much of the pixel, or of the cone around it, the layer blocks.
  * Cells are MULTIVIEW_CELL x MULTIVIEW_CELL pixels; bit s of a cell's mask says that layer s has something there.
  *
  * Peels may have MULTIVIEW_SCALE times the pixels of the image along x and y. What is called fine below has the size of
@@ -17,7 +18,7 @@
 
 #define MULTIVIEW_CELL 16
 #define MULTIVIEW_MAX_LAYERS 32
-/* Farther in px than any CoC: where slots with nothing in them stand. */
+/* Farther in px, and nearer in 1/m, than anything: where slots with nothing in them stand. */
 #define MULTIVIEW_NOWHERE 1e30f
 /* Slots at least this opaque are taken for opaque. */
 #define MULTIVIEW_OPAQUE 0.998f
@@ -68,69 +69,93 @@ typedef struct {
     int width, height, pitch, peels, layers, cells_x, cells_y;
 } MultiviewSize;
 
-/* How C is cut: layers of `fine` around the focus as far as `turn` to either side, then layers of `coarse`. */
+/* How inverse depth is cut, 1/m: layers of `fine` around `anchor` as far as `turn` to either side, then layers of
+ * `coarse`. `number` of them, with a fraction, are nearer than `anchor`. */
 typedef struct {
-    float fine, coarse, turn, front;
+    float anchor, fine, coarse, turn, number;
 } MultiviewSteps;
 
-/* Layers between the near end of the first layer and C, with a fraction. */
-static inline float16 layer_at(float16 c, MultiviewSteps steps)
+/* What depends on the lens of the frame, for each layer:
+ *   bound    inverse depth where it begins, 1/m, falling; the first and the last layer have no end
+ *   coc      C in its middle, px
+ *   largest  the largest blur radius that it may be met at, px
+ *   scale    of rays' moves; below 1 where the width of windows is part of the blur
+ *   window   half the width of its cones, fine pixels
+ *   reach    fine cells that its rays and cones may move to either side
+ *   needs    number of the set of rays that its blur takes, and 256 times that for bright light in it */
+typedef struct {
+    float bound[MULTIVIEW_MAX_LAYERS + 1], coc[MULTIVIEW_MAX_LAYERS], largest[MULTIVIEW_MAX_LAYERS];
+    float scale[MULTIVIEW_MAX_LAYERS], window[MULTIVIEW_MAX_LAYERS];
+    int reach[MULTIVIEW_MAX_LAYERS], needs[MULTIVIEW_MAX_LAYERS];
+} MultiviewPlaces;
+
+/* Layers between the near end of the first layer and an inverse depth, with a fraction. */
+static inline float16 layer_at(float16 w, MultiviewSteps steps)
 {
-    float16 away = c < 0.0f ? -c : c;
+    float16 c = steps.anchor - w, away = c < 0.0f ? -c : c;
     float16 near = away < steps.turn ? away : (float16)(steps.turn);
     float16 n = near / steps.fine + (away - near) / steps.coarse;
-    return (c < 0.0f ? -n : n) + (steps.front + 0.5f);
+    return (c < 0.0f ? -n : n) + steps.number;
 }
 
-static inline float16 coc_of(float16 w, float c1, float c0)
+/* The inverse depths of a layer: at most x, above y. Empty slots are outside of all. */
+static inline float2 ends_of(const __global MultiviewPlaces *places, int s, int layers)
 {
-    float16 c = w * c1 + c0;
-    return w < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : c;
+    return (float2)(s > 0 ? places->bound[s] : MULTIVIEW_NOWHERE, s + 1 < layers ? places->bound[s + 1] : -0.5f);
 }
 
-/* How far a surface goes on behind a slot on its way to the next pixel: the lesser step of both sides, so that a
- * silhouette does not count, and nothing where neither side is connected. */
-static inline float16 step_of(float16 c, float16 a, float16 b)
+/* How far a surface goes on behind a slot on its way to the next pixel, in 1/m: the lesser step of both sides, so that a
+ * silhouette does not count, and nothing where neither side is connected. `c1` px of C is one 1/m. */
+static inline float16 step_of(float16 w, float16 a, float16 b, float c1)
 {
-    float16 to_a = c > a ? c - a : a - c, to_b = c > b ? c - b : b - c;
+    float16 to_a = w > a ? w - a : a - w, to_b = w > b ? w - b : b - w;
+    to_a = a < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : to_a;
+    to_b = b < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : to_b;
     to_a = to_a < to_b ? to_a : to_b;
-    return to_a > MULTIVIEW_CONNECTED ? (float16)(0.0f) : to_a;
+    float16 px = to_a * (c1 < 0.0f ? -c1 : c1);
+    return px > MULTIVIEW_CONNECTED || to_a == MULTIVIEW_NOWHERE ? (float16)(0.0f) : to_a;
 }
 
-/* multiview_extent: the far end of every slot. A slot is a column from its own C to there, so that no ray slips
+/* multiview_place: keeps what depends on the lens where all passes of the frame find it.
+ * writes  places  MultiviewPlaces
+ * range   1-D, one item */
+__kernel void multiview_place(__global MultiviewPlaces *restrict places, MultiviewPlaces given)
+{
+    if (get_global_id(0) == 0) *places = given;
+}
+
+/* multiview_extent: the far end of every slot. A slot is a column from its own depth to there, so that no ray slips
  * between the pixels of a slope.
  * source  takes the place of the fixed 10 % overlap of layers, section 4.2
  * reads   inv_depth  float[peels][height][pitch]  1/m
- * writes  extent     float[peels][height][pitch]  px, C of the far end; -MULTIVIEW_NOWHERE where nothing is
+ * writes  extent     float[peels][height][pitch]  1/m; MULTIVIEW_NOWHERE where nothing is
  * range   3-D, one item per 16 fine pixels of a row of a peel, any local size */
 __kernel void multiview_extent(__global float *restrict extent, const __global float *restrict inv_depth,
-                               MultiviewSize size, float c1, float c0)
+                               MultiviewSize size, float c1)
 {
     const int x = 16 * (int)get_global_id(0), y = get_global_id(1), m = get_global_id(2);
     if (x >= size.pitch || y >= size.height || m >= size.peels) return;
     const size_t at = ((size_t)m * size.height + y) * size.pitch + x;
     const __global float *inv = inv_depth + at;
-    const float16 none = (float16)(MULTIVIEW_NOWHERE);
-    float16 w = load_quad(inv), c = coc_of(w, c1, c0);
+    const float16 none = (float16)(-1.0f);
+    float16 w = load_quad(inv);
     /* The ends of a row stand for their own neighbours. */
-    float16 left = x > 0 ? coc_of(load_quad(inv - 1), c1, c0) : (float16)(none.s0, c.s01234567, c.s89ab, c.scd, c.se);
-    float16 right = x + 16 < size.pitch ? coc_of(load_quad(inv + 1), c1, c0)
-                                        : (float16)(c.s12345678, c.s9abc, c.sde, c.sf, none.s0);
-    float16 above = y > 0 ? coc_of(load_quad(inv - size.pitch), c1, c0) : none;
-    float16 below = y + 1 < size.height ? coc_of(load_quad(inv + size.pitch), c1, c0) : none;
-    float16 end = c + MULTIVIEW_GOES_ON * (step_of(c, left, right) + step_of(c, above, below));
-    store_quad(extent + at, w < 0.0f ? -none : end);
+    float16 left = x > 0 ? load_quad(inv - 1) : (float16)(none.s0, w.s01234567, w.s89ab, w.scd, w.se);
+    float16 right = x + 16 < size.pitch ? load_quad(inv + 1) : (float16)(w.s12345678, w.s9abc, w.sde, w.sf, none.s0);
+    float16 above = y > 0 ? load_quad(inv - size.pitch) : none;
+    float16 below = y + 1 < size.height ? load_quad(inv + size.pitch) : none;
+    float16 end = w - MULTIVIEW_GOES_ON * (step_of(w, left, right, c1) + step_of(w, above, below, c1));
+    store_quad(extent + at, w < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : end);
 }
 
 /* multiview_cells: which layers have something in a cell; the first level of the N-buffer.
  * A slot close to the bound of two layers counts for both: a mask may say too much, never too little.
  * reads   inv_depth  float[peels][height][pitch]  1/m
- *         extent     float[peels][height][pitch]  px
+ *         extent     float[peels][height][pitch]  1/m
  * writes  nbuffer    uint[0][cells_y][cells_x]    bit s: layer s
  * range   2-D, one item per cell, any local size */
 __kernel void multiview_cells(__global uint *restrict nbuffer, const __global float *restrict inv_depth,
-                              const __global float *restrict extent, MultiviewSize size, MultiviewSteps steps,
-                              float c1, float c0)
+                              const __global float *restrict extent, MultiviewSize size, MultiviewSteps steps)
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= size.cells_x || cy >= size.cells_y) return;
@@ -141,7 +166,7 @@ __kernel void multiview_cells(__global uint *restrict nbuffer, const __global fl
         for (int y = cy * MULTIVIEW_CELL; y < y_end; y++) {
             const size_t at = ((size_t)m * size.height + y) * size.pitch + MULTIVIEW_CELL * cx;
             float16 w = load_quad(inv_depth + at);
-            float16 from = layer_at(w * c1 + c0, steps) - 1e-3f;
+            float16 from = layer_at(w, steps) - 1e-3f;
             float16 to = layer_at(load_quad(extent + at), steps) + 1e-3f;
             from = from < 0.0f ? (float16)(0.0f) : from;
             from = from > last ? (float16)(last) : from;
@@ -197,19 +222,19 @@ static inline uint masks_in(const __global uint *nbuffer, MultiviewSize fine, in
 /* multiview_wanted: which layers any ray may look at in a cell. The others need not be filled there, not even with
  * nothing: in a frame that is mostly in focus that is most of the work.
  * reads   nbuffer  uint[levels][fine cells_y][cells_x]
- *         reach    int[layers]   fine cells that rays and cones of a layer may move to either side
+ *         places   MultiviewPlaces
  * writes  wanted   uint[cells_y][cells_x]  bit s: layer s
  * range   2-D, one item per cell, any local size */
 __kernel void multiview_wanted(__global uint *restrict wanted, const __global uint *restrict nbuffer,
-                               const __global int *restrict reach, MultiviewSize fine, MultiviewSize size, int levels,
-                               int cull)
+                               const __global MultiviewPlaces *restrict places, MultiviewSize fine, MultiviewSize size,
+                               int levels, int cull)
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= size.cells_x || cy >= size.cells_y) return;
     uint list = 0u;
     for (int s = 0; s < size.layers; s++) {
         /* A pixel within reach of something looks as far again; runs share the lists of their cells. */
-        const int r = 2 * reach[s] + MULTIVIEW_STRIDE * MULTIVIEW_SCALE;
+        const int r = 2 * places->reach[s] + MULTIVIEW_STRIDE * MULTIVIEW_SCALE;
         const int x = cx * MULTIVIEW_SCALE, y = cy * MULTIVIEW_SCALE, last = MULTIVIEW_SCALE - 1;
         list |= masks_in(nbuffer, fine, levels, x - r, y - r, x + last + r, y + last + r) & 1u << s;
     }
@@ -220,12 +245,15 @@ __kernel void multiview_wanted(__global uint *restrict wanted, const __global ui
  * discs show it most.
  * reads   moments  float4[layers][fine cells_y][cells_x]  as multiview_split writes them
  *         nbuffer  uint[0][fine cells_y][cells_x]
- *         nominal  float[layers]  px, for layers with nothing of their own
+ *         places   MultiviewPlaces
  * writes  coc      float[layers]  px
+ * scalars the mean counts from a blur of `least` px on, in full from `full` px on: nearer to the focus, and for layers
+ *         with nothing of their own, it is the middle
  * range   1-D, one item per layer, any local size */
 __kernel void multiview_centres(__global float *restrict coc, const __global float4 *restrict moments,
-                                const __global uint *restrict nbuffer, const __global float *restrict nominal,
-                                MultiviewSize fine, float least)
+                                const __global uint *restrict nbuffer,
+                                const __global MultiviewPlaces *restrict places, MultiviewSize fine, float least,
+                                float full)
 {
     const int s = get_global_id(0), cells = fine.cells_x * fine.cells_y;
     if (s >= fine.layers) return;
@@ -235,23 +263,24 @@ __kernel void multiview_centres(__global float *restrict coc, const __global flo
             total += moments[s * cells + i].x;
             weight += moments[s * cells + i].y;
         }
-    const float away = nominal[s] < 0.0f ? -nominal[s] : nominal[s];
-    coc[s] = away >= least && weight > 0.0f ? total / weight : nominal[s];
+    const float middle = places->coc[s], away = middle < 0.0f ? -middle : middle;
+    const float share = away >= full ? 1.0f : away < least ? 0.0f : (away - least) / (full - least);
+    coc[s] = share > 0.0f && weight > 0.0f ? middle + share * (total / weight - middle) : middle;
 }
 
 /* multiview_shifts: how many pixels each ray has moved at each layer.
  * reads   points  float2[rays]    on the lens, right and down, in units of its radius
  *         coc     float[layers]   px
- *         scale   float[layers]   of points; below 1 where the width of a layer's windows is part of its blur
+ *         places  MultiviewPlaces
  * writes  shifts  int2[rays][layers]  right and down
  * range   2-D, one item per layer and ray, any local size */
 __kernel void multiview_shifts(__global int2 *restrict shifts, const __global float2 *restrict points,
-                               const __global float *restrict coc, const __global float *restrict scale, int layers,
-                               int rays)
+                               const __global float *restrict coc, const __global MultiviewPlaces *restrict places,
+                               int layers, int rays)
 {
     const int s = get_global_id(0), i = get_global_id(1);
     if (s >= layers || i >= rays) return;
-    shifts[i * layers + s] = convert_int2_rtn(points[i] * (scale[s] * coc[s]) + 0.5f);
+    shifts[i * layers + s] = convert_int2_rtn(points[i] * (places->scale[s] * coc[s]) + 0.5f);
 }
 
 /* multiview_bright: which layers have light in a cell that a disc of blur shows; the first level of an N-buffer.
@@ -277,32 +306,31 @@ __kernel void multiview_bright(__global uint *restrict bright, const __global fl
  * reads   nbuffer  uint[levels][fine cells_y][cells_x]
  *         bright   uint[levels][fine cells_y][cells_x]
  *         coc      float[layers]  px
- *         reach    int[layers]    fine cells that rays and cones of a layer may move to either side
- *         moves    float[layers]  how far the farthest ray moves per px of C; where that comes to less than `still`, one
- *                                 ray says all
- *         needs    int2[layers]   set of rays for the blur of a layer, and for bright light in it
+ *         places   MultiviewPlaces
  * writes  lists    uint[cells_y][cells_x]  bit s: layer s
  *         sets     int[cells_y][cells_x]   set of rays
+ * scalars the farthest ray moves `farthest` px per px of C; where that comes to less than `still`, one ray says all
  * range   2-D, one item per cell, any local size */
 __kernel void multiview_lists(__global uint *restrict lists, __global int *restrict sets,
                               const __global uint *restrict nbuffer, const __global uint *restrict bright,
-                              const __global float *restrict coc, const __global int *restrict reach,
-                              const __global float *restrict moves, const __global int2 *restrict needs,
-                              MultiviewSize fine, MultiviewSize size, int levels, int cull, float still)
+                              const __global float *restrict coc, const __global MultiviewPlaces *restrict places,
+                              MultiviewSize fine, MultiviewSize size, int levels, int cull, float farthest, float still)
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= size.cells_x || cy >= size.cells_y) return;
     uint list = 0u;
     int set = 0;
     for (int s = 0; s < size.layers; s++) {
-        const int x0 = cx * MULTIVIEW_SCALE - reach[s], x1 = (cx + 1) * MULTIVIEW_SCALE - 1 + reach[s];
-        const int y0 = cy * MULTIVIEW_SCALE - reach[s], y1 = (cy + 1) * MULTIVIEW_SCALE - 1 + reach[s];
+        const int reach = places->reach[s];
+        const int x0 = cx * MULTIVIEW_SCALE - reach, x1 = (cx + 1) * MULTIVIEW_SCALE - 1 + reach;
+        const int y0 = cy * MULTIVIEW_SCALE - reach, y1 = (cy + 1) * MULTIVIEW_SCALE - 1 + reach;
         if (!(masks_in(nbuffer, fine, levels, x0, y0, x1, y1) >> s & 1u)) continue;
         list |= 1u << s;
-        const float move = (coc[s] < 0.0f ? -coc[s] : coc[s]) * moves[s];
-        if (move < still) continue;
+        /* A search looks at a layer from end to end. */
+        const float blur = MULTIVIEW_REFINE ? places->largest[s] : coc[s] < 0.0f ? -coc[s] : coc[s];
+        if (blur * (places->scale[s] * farthest) < still) continue;
         const int is_bright = masks_in(bright, fine, levels, x0, y0, x1, y1) >> s & 1u;
-        const int need = is_bright ? needs[s].y : needs[s].x;
+        const int need = is_bright ? places->needs[s] >> 8 : places->needs[s] & 255;
         set = set > need ? set : need;
     }
     lists[cy * size.cells_x + cx] = cull ? list : ~0u >> (MULTIVIEW_MAX_LAYERS - size.layers);
@@ -313,9 +341,10 @@ __kernel void multiview_lists(__global uint *restrict lists, __global int *restr
  * source  eq. 4; exact where the paper's single pass may lose fragments of triangles that cross a bound
  * reads   color      float[peels][fine height][width][4]
  *         inv_depth  float[peels][fine height][pitch]  1/m
- *         extent     float[peels][fine height][pitch]  px
+ *         extent     float[peels][fine height][pitch]  1/m
  *         nbuffer    uint[0][fine cells_y][cells_x]
  *         wanted     uint[cells_y][cells_x]
+ *         places     MultiviewPlaces
  * writes  layers     float[slot][fine height][pitch][4]  not with MULTIVIEW_PEELED
  *         moments    float4[layers][fine cells_y][cells_x]  sums of weighted C and of weights, most light; where the
  *                    layer has something
@@ -326,24 +355,25 @@ __kernel void multiview_split(
 #endif
                               __global float4 *moments, const __global float *restrict color, const __global float *restrict inv_depth,
                               const __global float *restrict extent, const __global uint *restrict nbuffer,
-                              const __global uint *restrict wanted, MultiviewSize fine, int wanted_x, float c1,
-                              float c0, float from, float to, int layer, int slot)
+                              const __global uint *restrict wanted, const __global MultiviewPlaces *restrict places,
+                              MultiviewSize fine, int wanted_x, float c1, float c0, int layer, int slot)
 {
     const int cx = get_global_id(0), cy = get_global_id(1), x = MULTIVIEW_CELL * cx;
     if (cx >= fine.cells_x || cy >= fine.cells_y) return;
     if (!(wanted[cy / MULTIVIEW_SCALE * wanted_x + cx / MULTIVIEW_SCALE] >> layer & 1u)) return;
     const int y_end = (cy + 1) * MULTIVIEW_CELL < fine.height ? (cy + 1) * MULTIVIEW_CELL : fine.height;
     const int peels = nbuffer[cy * fine.cells_x + cx] >> layer & 1u ? fine.peels : 0;
+    const float2 ends = ends_of(places, layer, fine.layers);
     float4 total = (float4)(0.0f), weights = (float4)(0.0f), most = (float4)(0.0f);
     for (int y = cy * MULTIVIEW_CELL; y < y_end; y++) {
         float16 quad[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
         for (int m = 0; m < peels; m++) {
             const size_t row = (size_t)m * fine.height + y;
-            float16 c = load_quad(inv_depth + row * fine.pitch + x) * c1 + c0;
+            float16 w = load_quad(inv_depth + row * fine.pitch + x), c = w * c1 + c0;
             float16 end = load_quad(extent + row * fine.pitch + x);
-            float16 in = c < to && end >= from ? (float16)(1.0f) : (float16)(0.0f);
+            float16 in = w > ends.y && end <= ends.x ? (float16)(1.0f) : (float16)(0.0f);
             if (sum16(in) == 0.0f) continue;
-            float16 own = c >= from ? in : (float16)(0.0f);
+            float16 own = w <= ends.x ? in : (float16)(0.0f);
             const __global float *rgba = color + (row * fine.width + x) * 4;
             const float4 ins[4] = {in.s0123, in.s4567, in.s89ab, in.scdef};
             const float4 owns[4] = {own.s0123, own.s4567, own.s89ab, own.scdef};
@@ -413,18 +443,25 @@ __kernel void multiview_past(__global float *restrict layers, const __global flo
  * reads   image    float[fine height][pitch][4]
  *         nbuffer  uint[0][fine cells_y][cells_x]
  *         wanted   uint[cells_y][cells_x]
+ *         places   MultiviewPlaces
  * writes  layers   float[slot][height][pitch][4]
- * scalars window of `taps` whole fine pixels from `first` fine pixels right of (and below) the pixel's first one on, and
- *         `edge` (0 to 1) of one more at either side
  * range   2-D, one item per MULTIVIEW_RUN x MULTIVIEW_CELL pixels, any local size */
 __kernel void multiview_cone(__global float *restrict layers, const __global float *restrict image,
                              const __global uint *restrict nbuffer, const __global uint *restrict wanted,
-                             MultiviewSize fine, MultiviewSize size, int layer, int slot, int first, int taps, float edge)
+                             const __global MultiviewPlaces *restrict places, MultiviewSize fine, MultiviewSize size,
+                             int layer, int slot)
 {
     const int x0 = MULTIVIEW_RUN * (int)get_global_id(0), cy = get_global_id(1);
     if (x0 >= size.pitch || cy >= size.cells_y) return;
     const int y_end = (cy + 1) * MULTIVIEW_CELL < size.height ? (cy + 1) * MULTIVIEW_CELL : size.height;
     const int x1 = x0 + MULTIVIEW_RUN < size.pitch ? x0 + MULTIVIEW_RUN : size.pitch;
+    /* `taps` whole fine pixels from `first` on, counted from the pixel's first one, and `edge` of one more at either
+     * side. Fine pixels stand around the middle of the pixel: one at 0, or two half of one away. */
+    const int is_odd = MULTIVIEW_SCALE % 2;
+    const float half_width = places->window[layer] - 0.5f * (float)is_odd;
+    const int whole = half_width < 1.0f ? 1 - is_odd : (int)half_width;
+    const int first = (MULTIVIEW_SCALE - is_odd) / 2 - whole, taps = 2 * whole + is_odd;
+    const float rest = half_width - (float)whole, edge = rest < 0.0f ? 0.0f : rest;
     const float scale = 1.0f / ((float)taps + 2.0f * edge);
     uint wants = 0u, around = 0u;
     for (int i = x0 / MULTIVIEW_CELL; i < (x0 + MULTIVIEW_RUN) / MULTIVIEW_CELL && i < size.cells_x; i++)
@@ -517,17 +554,17 @@ static inline float16 run_of(const __global float *row, int x, int is_inside, in
 
 /* What multiview_split would have put into a layer for 16 pixels, straight from the peels. */
 static inline void peeled_quads(float16 quad[4], const __global float *color, const __global float *inv_depth,
-                                const __global float *extent, MultiviewSize size, float c1, float c0, float from,
-                                float to, int x, int row, int is_inside, int is_outside)
+                                const __global float *extent, MultiviewSize size, float2 ends, int x, int row,
+                                int is_inside, int is_outside)
 {
     for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
     for (int m = 0; m < size.peels; m++) {
         const size_t line = (size_t)m * size.height + row;
         float16 end = run_of(extent + line * size.pitch, x, is_inside, size.width);
-        float16 near = run_of(inv_depth + line * size.pitch, x, is_inside, size.width) * c1 + c0;
-        float16 in = near < to && end >= from ? (float16)(1.0f) : (float16)(0.0f);
+        float16 near = run_of(inv_depth + line * size.pitch, x, is_inside, size.width);
+        float16 in = near > ends.y && end <= ends.x ? (float16)(1.0f) : (float16)(0.0f);
         if (sum16(in) == 0.0f) continue;
-        float16 own = near >= from ? in : (float16)(0.0f);
+        float16 own = near <= ends.x ? in : (float16)(0.0f);
         const __global float *rgba = color + line * size.width * 4;
         const float4 ins[4] = {in.s0123, in.s4567, in.s89ab, in.scdef};
         const float4 owns[4] = {own.s0123, own.s4567, own.s89ab, own.scdef};
@@ -546,14 +583,14 @@ static inline void peeled_quads(float16 quad[4], const __global float *color, co
 #if MULTIVIEW_PEELED && MULTIVIEW_REFINE
 /* C of the first slot with something between two C, for each pixel of a run; MULTIVIEW_NOWHERE where there is none. */
 static inline float16 first_between(const __global float *inv_depth, const __global float *extent, MultiviewSize size,
-                                    float c1, float c0, float from, float to, int x, int row, int is_inside)
+                                    float c1, float c0, float2 ends, int x, int row, int is_inside)
 {
     float16 first = (float16)(MULTIVIEW_NOWHERE);
     for (int m = 0; m < size.peels; m++) {
         const size_t line = ((size_t)m * size.height + row) * size.pitch;
-        float16 near = run_of(inv_depth + line, x, is_inside, size.width) * c1 + c0;
+        float16 near = run_of(inv_depth + line, x, is_inside, size.width);
         float16 end = run_of(extent + line, x, is_inside, size.width);
-        near = near < to && end >= from ? near : (float16)(MULTIVIEW_NOWHERE);
+        near = near > ends.y && end <= ends.x ? near * c1 + c0 : (float16)(MULTIVIEW_NOWHERE);
         first = near < first ? near : first;
     }
     return first;
@@ -564,8 +601,8 @@ static inline float16 first_between(const __global float *inv_depth, const __glo
  * parallel: those in the same part of the layer have moved by the same whole number of pixels, and each part that some
  * of them are in is one contiguous look-up. */
 static inline void refined_quads(float16 quad[4], const __global float *color, const __global float *inv_depth,
-                                 const __global float *extent, MultiviewSize size, float c1, float c0, float from,
-                                 float to, float2 limits, float2 point, int x0, int y)
+                                 const __global float *extent, MultiviewSize size, float c1, float c0, float2 ends,
+                                 float2 limits, float2 point, int x0, int y)
 {
     for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
     float16 part = (float16)(0.0f);
@@ -580,14 +617,13 @@ static inline void refined_quads(float16 quad[4], const __global float *color, c
             const int x = x0 + by.x, row = clamp_index(y + by.y, size.height - 1);
             const int is_inside = x >= 0 && x + MULTIVIEW_SPAN <= size.width && row == y + by.y;
             if (level < MULTIVIEW_REFINE) {
-                float16 first = first_between(inv_depth, extent, size, c1, c0, from, to, x, row, is_inside);
+                float16 first = first_between(inv_depth, extent, size, c1, c0, ends, x, row, is_inside);
                 float16 half_of = first < c ? (float16)(2.0f * k) : (float16)(2.0f * k + 1.0f);
-                if (level == 0) half_of = first < to ? half_of : (float16)(-1.0f);
+                if (level == 0) half_of = first < MULTIVIEW_NOWHERE ? half_of : (float16)(-1.0f);
                 next = is_here > 0.0f ? half_of : next;
             } else {
                 float16 met[4];
-                peeled_quads(met, color, inv_depth, extent, size, c1, c0, from, to, x, row, is_inside,
-                             row != y + by.y);
+                peeled_quads(met, color, inv_depth, extent, size, ends, x, row, is_inside, row != y + by.y);
                 const float4 here[4] = {is_here.s0123, is_here.s4567, is_here.s89ab, is_here.scdef};
                 for (int q = 0; q < 4; q++) quad[q] += met[q] * spread(here[q]);
             }
@@ -649,8 +685,7 @@ __kernel void multiview_finish(__global float *restrict image, const __global fl
  * source  sections 4.3 and 4.4: v1 * c1 + (1 - v1) * c2
  * reads   layers    float[layers (+ 1)][height][pitch][4]
  *         color     float[peels][fine height][width][4]
- *         inv_depth, extent, bounds  as multiview_split has them; with MULTIVIEW_PEELED only, in place of layers
- *         limits    float[layers + 1]  px, bounds that end, and
+ *         inv_depth, extent, places  as multiview_split has them; with MULTIVIEW_PEELED only, in place of layers
  *         points    float2[rays]       as multiview_shifts has them; with MULTIVIEW_REFINE only
  *         lists     uint[cells_y][cells_x]
  *         sets      int[cells_y][cells_x]
@@ -665,9 +700,9 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
                               const __global float *restrict color,
 #if MULTIVIEW_PEELED
                               const __global float *restrict inv_depth, const __global float *restrict extent,
-                              const __global float *restrict bounds, float c1, float c0,
+                              const __global MultiviewPlaces *restrict places,
 #if MULTIVIEW_REFINE
-                              const __global float *restrict limits, const __global float2 *restrict points,
+                              const __global float2 *restrict points, float c1, float c0,
 #endif
 #endif
                               MultiviewSize size, int guard
@@ -712,12 +747,12 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
                 const int is_inside = x >= 0 && x + MULTIVIEW_SPAN <= size.width && row == inside;
 #if MULTIVIEW_PEELED
                 if (s < size.layers) {
+                    const float2 ends = ends_of(places, s, size.layers);
 #if MULTIVIEW_REFINE
-                    refined_quads(c, color, inv_depth, extent, size, c1, c0, bounds[s], bounds[s + 1],
-                                  (float2)(limits[s], limits[s + 1]), points[rays.x + i], x0, y);
+                    const float2 limits = (float2)(places->bound[s], places->bound[s + 1]) * c1 + c0;
+                    refined_quads(c, color, inv_depth, extent, size, c1, c0, ends, limits, points[rays.x + i], x0, y);
 #else
-                    peeled_quads(c, color, inv_depth, extent, size, c1, c0, bounds[s], bounds[s + 1], x, inside,
-                                 is_inside, row != inside);
+                    peeled_quads(c, color, inv_depth, extent, size, ends, x, inside, is_inside, row != inside);
 #endif
                 } else
 #endif

@@ -9,6 +9,7 @@ Where this differs from the paper, docs/methods/multiview.md has the measurement
 
 - Layers are thin (half a pixel of CoC where 32 of them allow it), so that a ray meets each at one place and needs no
   search by false position. All pixels of a run then move alike, and look-ups are contiguous.
+- Layers stand still in the scene while the focus moves (with one sample a pixel), not at fixed circles of confusion.
 - Layers overlap as far as the surface slopes from pixel to pixel, not by a fixed 10 %.
 - Cones see means over windows of exactly their width, not mip levels.
 - The number of rays follows the blur of what a cell of 16 x 16 pixels can see, and rises where light is bright.
@@ -21,6 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +41,7 @@ __all__ = [
     "MAX_LAYERS",
     "MAX_RAYS",
     "Cone",
+    "Layering",
     "LensLayers",
     "Multiview",
     "RaySets",
@@ -57,8 +60,10 @@ MAX_RAYS = 1024
 
 # CoC growth from layer to layer (px) when none is given. Thinner layers gain less than 0.3 dB.
 _USUAL_DELTA_PX = 0.5
-# Growth rises on this grid, so that a lens in motion keeps to few pass lists.
+# Growth around the focus rises on this grid, so that a lens in motion keeps to few pass lists.
 _STEPS_PER_OCTAVE = 8
+# Layers without windows begin and end at multiples of this, for the same reason.
+_PLAIN_GRID = 4
 # Layers may not take more than this on the device; there are then fewer of them.
 _LAYER_BYTES = 1 << 30
 _FEWEST_LAYERS = 5
@@ -71,8 +76,9 @@ _FEWEST_TO_REFINE = 24
 _CONE_WIDTH = 1.1
 # With several samples a pixel: below this C a window does all of the blur, up to that one it is taken off the rays'.
 _WINDOW_PX, _MATCHED_PX = 0.8, 4.0
-# Layers nearer to the focus are met in their middle: there whole pixels of shift blur more than they should.
-_CENTRED_PX = 0.8
+# Layers nearer to the focus are met in their middle: there whole pixels of shift blur more than they should. Those that
+# stand still in the scene go over to the mean as far as the second figure.
+_CENTRED_PX, _ALL_CENTRED_PX = 0.8, 1.2
 # Rays that move by less all stay in their pixel.
 _STILL_PX = 0.499
 # Light above this (constant of kernels/multiview.cl) that is blurred by so many px gets so many times the rays.
@@ -87,62 +93,124 @@ _JITTER = 4
 _BAYER = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
 
 _SIZE = np.dtype([(n, np.int32) for n in ("width", "height", "pitch", "peels", "layers", "cells_x", "cells_y")])
-_STEPS = np.dtype([(n, np.float32) for n in ("fine", "coarse", "turn", "front")])
+_STEPS = np.dtype([(n, np.float32) for n in ("anchor", "fine", "coarse", "turn", "number")])
+_PLACES = np.dtype(
+    [
+        ("bound", np.float32, MAX_LAYERS + 1),
+        *((n, np.float32, MAX_LAYERS) for n in ("coc", "largest", "scale", "window")),
+        *((n, np.int32, MAX_LAYERS) for n in ("reach", "needs")),
+    ]
+)
 _FLOAT = np.dtype(np.float32)
-# Farther than any CoC in px, nearer than slots with nothing in them: the first and last layers have no end.
-_ENDLESS = 1e20
 
 
 class LensLayers(NamedTuple):
-    """Which layers there are, through what aperture they are seen, and from how many of its points they are shaded.
+    """How many layers there are, through what aperture they are seen, and from how many of its points they are shaded.
 
-    Layers around the focus may be thinner: ``fine`` of them to either side are ``fine_px`` thick, the others
-    ``delta_px``. ``eyes`` is 0 where all that the lens sees looks the same from all of it.
+    Layers ``plain[0]`` to ``plain[1]``, the end not among them, have no windows. ``eyes`` is 0 where all that the lens
+    sees looks the same from all of it. ``halvings`` is how often the way of rays through a layer is halved. Layers that
+    are ``refined`` are thinner around the focus and move with it.
     """
 
-    front: int
-    back: int
-    delta_px: float
+    total: int
     aperture: Aperture
+    plain: tuple[int, int]
     eyes: int = 0
-    fine: int = 0
-    fine_px: float = 0.0
+    halvings: int = 0
+    refined: bool = False
+
+
+class Layering(NamedTuple):
+    """Where layers are.
+
+    Attributes
+    ----------
+    inverse : ndarray of float32, (K + 1,)
+        Inverse depths in 1/m where layers begin, falling.
+    c1, c0 : float
+        Signed CoC radius in px of the image is ``c1 * inverse + c0``.
+    anchor, fine, coarse, turn, number : float
+        The same for kernels, in 1/m: ``number`` layers are nearer than ``anchor``, those up to ``turn`` to either side
+        of it are ``fine`` thick and the others ``coarse``.
+    refined : bool
+        The layer in the middle is in focus, and those around it are thinner.
+    """
+
+    inverse: NDArray[np.float32]
+    c1: float
+    c0: float
+    anchor: float
+    fine: float
+    coarse: float
+    turn: float
+    number: float
+    refined: bool = False
+
+    @classmethod
+    def anchored(cls, nearest: float, farthest: float, c1: float, c0: float, delta_px: float, most: int) -> Layering:
+        """Even layers that stand still in the scene: their number depends on the aperture, not on the focus."""
+        wanted = math.ceil(min((nearest - farthest) * abs(c1) / delta_px - 1e-6, float(most)))
+        # 1, 2, 3, 4, 6, 8, 12, ...: an aperture in motion keeps to few of them.
+        octave = 1 << max(0, wanted - 1).bit_length()
+        count = max(1, min(octave * 3 // 4 if octave >= 4 and wanted <= octave * 3 // 4 else octave, most))
+        inverse = np.linspace(nearest, farthest, count + 1).astype(np.float32)
+        step = max((nearest - farthest) / count, 1e-9)  # kernels divide by it
+        return cls(inverse, c1, c0, nearest, step, step, 0.0, 0.0)
+
+    @classmethod
+    def around_focus(
+        cls, nearest: float, farthest: float, c1: float, c0: float, delta_px: float, most: int
+    ) -> Layering:
+        """Layers at fixed C, thinner near the focus; growth rises until there are no more than ``most``."""
+        near_px, far_px = max(0.0, -(c1 * nearest + c0)), max(0.0, c1 * farthest + c0)
+        fine_px = min(_FINE_DELTA_PX, delta_px)
+        turn = (_FINE_LAYERS + 0.5) * fine_px
+        for exponent in range(10**6):
+            delta = delta_px * math.pow(2.0, exponent / _STEPS_PER_OCTAVE)
+            # The layer in focus takes half a step of either side.
+            front, back = (
+                max(
+                    0,
+                    math.ceil(px / fine_px - 0.5) if px <= turn else _FINE_LAYERS + math.ceil((px - turn) / delta),
+                )
+                for px in (near_px, far_px)
+            )
+            if front + 1 + back <= most:
+                break
+        number = np.arange(-front, back + 2) - 0.5
+        away = np.abs(number)
+        coc = np.sign(number) * np.where(
+            away <= _FINE_LAYERS + 0.5, away * fine_px, turn + (away - _FINE_LAYERS - 0.5) * delta
+        )
+        # Through a pinhole, where there is one layer, any will do.
+        per_px = 1.0 / abs(c1) if c1 else 1.0
+        focus = -c0 / c1 if c1 else nearest
+        inverse = (focus - coc * per_px).astype(np.float32)
+        return cls(inverse, c1, c0, focus, fine_px * per_px, delta * per_px, turn * per_px, front + 0.5, refined=True)
 
     @property
     def total(self) -> int:
         """K."""
-        return self.front + 1 + self.back
+        return len(self.inverse) - 1
 
     @property
-    def steps(self) -> tuple[float, float, float, float]:
-        """Steps near the focus and beyond, the C in px where they change, and the number of the layer in focus."""
-        near = self.fine_px or self.delta_px
-        return near, self.delta_px, (self.fine + 0.5) * near, float(self.front)
-
-    def _place(self, number: NDArray[np.float64]) -> NDArray[np.float64]:
-        near, step, turn, _ = self.steps
-        away = np.abs(number)
-        return np.sign(number) * np.where(away <= self.fine + 0.5, away * near, turn + (away - self.fine - 0.5) * step)
-
-    @property
-    def coc(self) -> NDArray[np.float64]:
-        """Signed CoC radius in px at the middle of each layer, (K,), rising; 0 for the layer in focus.
-
-        With ``Multiview.is_centred`` rays meet a layer at the mean of what it holds instead, if there is something.
-        """
-        return self._place(np.arange(-self.front, self.back + 1, dtype=np.float64))
+    def delta_px(self) -> float:
+        """Growth of C from layer to layer, px, but for thinner ones."""
+        return abs(self.c1) * self.coarse
 
     @property
     def limits(self) -> NDArray[np.float64]:
-        """CoC in px where layers begin, (K + 1,)."""
-        return self._place(np.arange(-self.front, self.back + 2, dtype=np.float64) - 0.5)
+        """CoC in px where layers begin, (K + 1,), rising."""
+        return self.c1 * self.inverse.astype(np.float64) + self.c0
 
     @property
-    def bounds(self) -> NDArray[np.float32]:
-        """As ``limits``, but without end: layer k reaches from ``bounds[k]`` to ``bounds[k + 1]``."""
-        bounds = self.limits
-        bounds[0], bounds[-1] = -_ENDLESS, _ENDLESS
-        return bounds.astype(np.float32)
+    def coc(self) -> NDArray[np.float64]:
+        """Signed CoC radius in px in the middle of each layer, (K,), rising."""
+        limits = self.limits
+        middle = (limits[1:] + limits[:-1]) / 2.0
+        if self.refined:
+            middle[int(self.number)] = 0.0
+        return middle
 
     @property
     def largest(self) -> NDArray[np.float64]:
@@ -150,17 +218,39 @@ class LensLayers(NamedTuple):
         limits = np.abs(self.limits)
         return np.maximum(limits[1:], limits[:-1])
 
+    def met(self, farthest: float) -> NDArray[np.float64]:
+        """C in px at which layers are met, (K,): in their middle, but what is in focus stays where it is.
+
+        Rays move by up to ``farthest`` px per px of C. Where half a layer is more than a ray may move and be rounded to
+        nothing, blur grows from nothing at that distance, and catches up with C at twice of it.
+        """
+        coc = self.coc
+        half, still = self.delta_px / 2.0, _STILL_PX / max(farthest, 1e-6)
+        if self.refined or half <= still:
+            return coc
+        away = np.abs(coc)
+        eased = np.where(away < 2.0 * half, np.interp(away, (0.0, half, 2.0 * half), (0.0, still, 2.0 * half)), away)
+        return np.asarray(np.sign(coc) * eased)
+
 
 class Cone(NamedTuple):
     """Window of a mean, in pixels of the peels.
 
     ``taps`` whole ones from ``first`` on, counted from the pixel's own first one, and ``edge`` of one more at either
-    side.
+    side: ``half`` to either side of the pixel's middle.
     """
 
     first: int
     taps: int
     edge: float
+    half: float
+
+    @classmethod
+    def of(cls, half: float, supersample: int) -> Cone:
+        """The window that reaches so far, in pixels of the peels: one stands in the pixel's middle, or none does."""
+        is_odd = supersample % 2
+        whole = max(int(half - 0.5 * is_odd), 1 - is_odd)
+        return cls((supersample - is_odd) // 2 - whole, 2 * whole + is_odd, max(0.0, half - 0.5 * is_odd - whole), half)
 
 
 class RaySets(NamedTuple):
@@ -172,16 +262,34 @@ class RaySets(NamedTuple):
         First ray and number of rays. There is one group for each eye, of the rays closest to it; one if there are none.
     points : ndarray of float32, (rays, 2)
         Where a ray stands per px of C: right and down, at most 1 or so.
-    needs : ndarray of int32, (K, 2)
-        Which set the blur of a layer asks for, and which bright light in it.
+    counts : tuple of int
+        Rays of each set; the usual one is the last, or the last but one where bright light takes more.
+    usual : int
+        Its number.
     eyes : ndarray, (groups, 2)
         Middle of each group on the lens: right and up, in units of its radius.
     """
 
     ranges: NDArray[np.int32]
     points: NDArray[np.float32]
-    needs: NDArray[np.int32]
+    counts: tuple[int, ...]
+    usual: int
     eyes: NDArray[np.float64]
+
+    @property
+    def farthest(self) -> float:
+        """How far a ray moves per px of C, at most."""
+        return float(np.abs(self.points).max())
+
+    def needs(self, blur: NDArray[np.float64], adaptive: bool) -> NDArray[np.int32]:
+        """Which set each blur radius in px asks for, and which with bright light, (K, 2)."""
+        needs = np.full((len(blur), 2), self.usual)
+        if adaptive:
+            wanted = _RAYS_PER_PX2 * math.pi * (blur + 0.5) ** 2
+            found = np.searchsorted(self.counts[: self.usual + 1], wanted)
+            needs[:] = np.minimum(np.maximum(found, 1), self.usual)[:, None]
+        needs[blur >= _BRIGHT_PX, 1] = len(self.counts) - 1
+        return needs.astype(np.int32)
 
 
 @dataclass(frozen=True)
@@ -290,55 +398,95 @@ class Multiview:
         """Whether rays are thickened."""
         return self.traversal == "layers" if self.cone is None else self.cone
 
-    def halvings(self, layers: LensLayers) -> int:
-        """How often the way of rays through these layers is halved."""
+    def halvings(self, delta_px: float) -> int:
+        """How often the way of rays through layers of this growth is halved."""
         if self.traversal == "layers":
             return 0
         if self.refine_steps is not None:
             return self.refine_steps
-        return _USUAL_HALVINGS if layers.delta_px > _COARSE_PX else 0
+        return _USUAL_HALVINGS if delta_px > _COARSE_PX else 0
 
     def supersampled(self, factor: int) -> Multiview:
         """This method for frames with ``factor`` times the pixels; itself where it cannot take them in."""
         return replace(self, supersample=factor) if self.traversal == "layers" else self
 
     def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
-        """Choose the layers from the CoC range."""
+        """Choose the layers from the range of depths, and what of them depends on the lens."""
+        where = self.layering(frame, lens)
+        eyes = 0
+        if self.view_dependent and frame.is_glossy_through(lens):
+            eyes = min(self.eyes, self.rays)
+        halvings = self.halvings(where.delta_px)
+        rays = ray_sets(self, lens.aperture, max(1, eyes))
+        met, largest = where.met(rays.farthest), where.largest
+        windows = self.windows(where, lens.aperture)
+        scales = shift_scales(where.coc, self.supersample, lens.aperture, self.antialias)
+        moves = np.floor(rays.farthest * scales * (largest + 1e-3) + 0.5) * self.supersample
+        halos = np.array([max(-w.first, w.first + w.taps) + 1 if w else 0 for w in windows])
+        needs = rays.needs(largest if halvings else np.abs(met), self.adaptive)
+        places = np.zeros((), _PLACES)
+        for name, values in (
+            ("bound", where.inverse),
+            ("coc", met),
+            ("largest", largest),
+            ("scale", scales),
+            ("window", [w.half if w else 0.5 for w in windows]),
+            ("reach", np.minimum(np.ceil((moves + halos) / CELL), 1e6)),
+            ("needs", needs[:, 0] + 256 * needs[:, 1]),
+        ):
+            places[name][: len(values)] = values
+        plain = _plain([w is None for w in windows])
+        structure = LensLayers(where.total, lens.aperture, plain, eyes, halvings, where.refined)
+        limits = where.limits
+        summary = {
+            "method": self.name,
+            **{field.name: getattr(self, field.name) for field in fields(self)},
+            "layers": where.total,
+            "focus_layer": int(np.clip(np.searchsorted(limits, 0.0) - 1, 0, where.total - 1)),
+            "delta_px": where.delta_px,
+            "largest_near_coc_px": max(0.0, -float(limits[0])),
+            "largest_far_coc_px": max(0.0, float(limits[-1])),
+            "eyes": eyes,
+            "refine_steps": halvings,
+            "highlight_rays": min(_BRIGHT_RAYS * self.rays, MAX_RAYS),
+            "highlight_above": _BRIGHT,
+            "highlight_coc_px": _BRIGHT_PX,
+        }
+        steps = (where.anchor, where.fine, where.coarse, where.turn, where.number)
+        params = {
+            "c1": np.float32(where.c1),
+            "c0": np.float32(where.c0),
+            "steps": struct_scalar(_STEPS, *steps),
+            "given": places[()],
+        }
+        if eyes:
+            params["aperture_radius_m"] = np.float32(lens.aperture_radius_m)
+        return Plan(structure, params, summary)
+
+    def layering(self, frame: LayeredFrame, lens: Lens) -> Layering:
+        """Where the layers of a frame are through a lens."""
         c1, c0 = (value / self.supersample for value in lens.coc_coefficients(frame.camera))
         farthest, nearest = frame.inverse_depth_range
         if not frame.is_opaque:
             farthest = 0.0  # the void is a surface at infinity
-        near_px, far_px = max(0.0, -(c1 * nearest + c0)), max(0.0, c1 * farthest + c0)
         shape = FrameShape.of(frame)
         most = self.layers
         if self.traversal == "layers":
             layer_bytes = shape.height * shape.pitch * 16 // self.supersample**2
             most = min(most, max(_FEWEST_LAYERS, _LAYER_BYTES // layer_bytes - 2))
-        refined = self.supersample > 1 and most >= _FEWEST_TO_REFINE
-        layers = _layers(near_px, far_px, self.delta_px or _USUAL_DELTA_PX, most, lens.aperture, refined)
-        if self.view_dependent and frame.is_glossy_through(lens):
-            layers = layers._replace(eyes=min(self.eyes, self.rays))
-        summary = {
-            "method": self.name,
-            **{field.name: getattr(self, field.name) for field in fields(self)},
-            "layers": layers.total,
-            "focus_layer": layers.front,
-            "delta_px": layers.delta_px,
-            "largest_near_coc_px": near_px,
-            "largest_far_coc_px": far_px,
-            "eyes": layers.eyes,
-            "refine_steps": self.halvings(layers),
-            "highlight_rays": min(_BRIGHT_RAYS * self.rays, MAX_RAYS),
-            "highlight_above": _BRIGHT,
-            "highlight_coc_px": _BRIGHT_PX,
-        }
-        params = {"c1": np.float32(c1), "c0": np.float32(c0)}
-        if layers.eyes:
-            params["aperture_radius_m"] = np.float32(lens.aperture_radius_m)
-        return Plan(layers, params, summary)
+        kind = Layering.anchored
+        if self.supersample > 1 and most >= _FEWEST_TO_REFINE:
+            kind = Layering.around_focus
+        return kind(nearest, farthest, c1, c0, self.delta_px or _USUAL_DELTA_PX, most)
+
+    def windows(self, where: Layering, aperture: Aperture) -> list[Cone | None]:
+        """What each layer is averaged over."""
+        if self.supersample == 1 and not self.has_cones:
+            return [None] * where.total
+        return cones(where.coc, self.rays if self.has_cones else 0, self.supersample, aperture, self.antialias)
 
     def locality(self, shape: FrameShape, plan: Plan, traits: Traits, tail: float) -> Locality | None:
-        """Rays go no farther than their CoC; those of the layer in focus do not leave their pixel.
+        """Rays go no farther than their CoC; those of layers close to the focus do not leave their pixel.
 
         Shading from the points of the lens depends on the place in the image, also in focus; where layers are met
         depends on all of the frame.
@@ -347,16 +495,23 @@ class Multiview:
         assert isinstance(layers, LensLayers)
         if layers.eyes or self.is_centred or self.supersample > 1:
             return None
-        halvings = self.halvings(layers)
-        # Slots in the layer in focus stay in their pixel; after a search for them, those that rays do not leave.
-        still = 0.49 * layers.delta_px if not halvings or layers.delta_px < 1.0 else 0.0
-        largest = layers.delta_px * (max(layers.front, layers.back) + 1)
+        places: Any = plan.params["given"]
+        count = layers.total
+        limits = float(plan.params["c1"]) * places["bound"][: count + 1].astype(np.float64) + float(plan.params["c0"])
+        # After a search for what is in a layer, those stay that rays do not leave from end to end.
+        met = np.abs(places["largest" if layers.halvings else "coc"][:count])
+        moved = met * ray_sets(self, layers.aperture, 1).farthest >= 0.4999
+        # The least blur of anything in a layer that rays move in; a slot so close to a bound may count for both.
+        gap = np.maximum(np.maximum(limits[:-1], -limits[1:]), 0.0)[moved] - 2e-3 * plan.summary["delta_px"]
+        still = float(gap.min(initial=np.inf))
+        largest = float(np.abs(limits).max())
+        delta_px = plan.summary["delta_px"]
         cone = _HALO if self.has_cones else 0
         return Locality(
             align_px=_RUN,
             # Cells look for layers in whole cells around them.
-            margin_px=math.ceil(largest) + cone + 3 * CELL,
-            reach_px=lambda coc: coc + layers.delta_px + cone + 2.0,
+            margin_px=math.ceil(largest + delta_px) + cone + 3 * CELL,
+            reach_px=lambda coc: coc + delta_px + cone + 2.0,
             leak=lambda coc: np.where(coc < still, 0.0, 1.0),
             counts_slopes=True,
         )
@@ -368,86 +523,83 @@ class Multiview:
         return _Builder(self, shape, layers, traits).build()
 
 
-def _layers(
-    near_px: float, far_px: float, delta_px: float, most: int, aperture: Aperture, refined: bool = False
-) -> LensLayers:
-    fine, fine_px = (_FINE_LAYERS, min(_FINE_DELTA_PX, delta_px)) if refined else (0, 0.0)
-    for exponent in range(10**6):
-        delta = delta_px * math.pow(2.0, exponent / _STEPS_PER_OCTAVE)
-        # The layer in focus takes half a step of either side.
-        if refined:
-            turn = (fine + 0.5) * fine_px
-            front, back = (
-                math.ceil(px / fine_px - 0.5) if px <= turn else fine + math.ceil((px - turn) / delta)
-                for px in (near_px, far_px)
-            )
-        else:
-            front, back = (math.ceil(px / delta - 0.5) for px in (near_px, far_px))
-        front, back = max(0, front), max(0, back)
-        if front + 1 + back <= most:
-            return LensLayers(front, back, delta, aperture, 0, fine, fine_px)
-    raise AssertionError("a step that is large enough needs one layer a side")
+def _plain(has_none: list[bool]) -> tuple[int, int]:
+    """First and end of the layers that surely have no windows, on a grid: the others may have any."""
+    if not any(has_none):
+        return 0, 0
+    first, end = has_none.index(True), len(has_none) - has_none[::-1].index(True)
+    first = -(-first // _PLAIN_GRID) * _PLAIN_GRID
+    if end < len(has_none):
+        end = end // _PLAIN_GRID * _PLAIN_GRID
+    return (first, end) if first < end else (0, 0)
 
 
-def cones(layers: LensLayers, rays: int, supersample: int = 1, antialias: bool = True) -> list[Cone | None]:
-    """Window of each layer; None where it is no wider than the one sample that a pixel has."""
+def cones(
+    coc: NDArray[np.float64], rays: int, supersample: int, aperture: Aperture, antialias: bool = True
+) -> list[Cone | None]:
+    """Window of layers at these C; None where it is no wider than the one sample that a pixel has."""
     # A uniform disc has a variance of 1/4 along each axis and an area of pi.
-    deviations = layers.aperture.samples(256).std(axis=0)
+    deviations = _points(aperture).std(axis=0)
     distance = math.sqrt(4.0 * math.pi * float(deviations.prod()) / rays) if rays else 0.0
     windows: list[Cone | None] = []
-    for coc in np.abs(layers.coc).tolist():
-        width = _CONE_WIDTH * distance * coc
+    for blur in np.abs(coc).tolist():
+        width = _CONE_WIDTH * distance * blur
         if supersample > 1:
-            width = max(width, _blur_window(coc, layers.aperture, antialias))
+            width = max(width, _blur_window(blur, aperture, antialias))
         half = min(width * supersample / 2.0, _HALO * supersample - 2.0)
         if supersample == 1 and half <= 0.5:
             windows.append(None)
             continue
-        # Pixels of the peels stand around the middle of the image's: one at 0, or two half a pixel away.
-        offset = 0.5 if supersample % 2 else 0.0
-        whole = max(int(half - offset), 0 if supersample % 2 else 1)
-        first = (supersample - 1) // 2 - whole if supersample % 2 else supersample // 2 - whole
-        windows.append(Cone(first, 2 * whole + supersample % 2, max(0.0, half - offset - whole)))
+        windows.append(Cone.of(half, supersample))
     return windows
+
+
+@cache
+def _points(aperture: Aperture) -> NDArray[np.float64]:
+    return aperture.samples(256)
 
 
 def _blur_window(coc: float, aperture: Aperture, antialias: bool) -> float:
     """Width in px of the box that does what shifts by whole pixels cannot, with several samples a pixel."""
     if coc >= _WINDOW_PX:
         return 1.0
-    variance = coc**2 * float(aperture.samples(256).var(axis=0).mean())
+    variance = coc**2 * float(_points(aperture).var(axis=0).mean())
     return math.sqrt(12.0 * variance + antialias)
 
 
-def shift_scales(layers: LensLayers, supersample: int, antialias: bool) -> NDArray[np.float64]:
-    """What shifts of each layer are scaled by, (K,).
+def shift_scales(
+    coc: NDArray[np.float64], supersample: int, aperture: Aperture, antialias: bool = True
+) -> NDArray[np.float64]:
+    """What shifts of layers at these C are scaled by, (K,).
 
     Windows and the rounding of shifts blur as well; below 4 px of C that is taken off the shifts, so that the variance
     of all is right.
     """
-    scales = np.ones(layers.total)
-    if supersample == 1:
-        return scales
-    points = layers.aperture.samples(256)
-    tries = np.linspace(0.0, 1.2, 241)
-    for layer, coc in enumerate(np.abs(layers.coc).tolist()):
-        if coc < _WINDOW_PX:
-            scales[layer] = 0.0
-        elif coc < _MATCHED_PX:
-            wanted = coc**2 * points.var(axis=0).mean() + (0.0 if antialias else -1.0 / 12.0)
-            found = np.floor(coc * tries[:, None, None] * points + 0.5).var(axis=1).mean(axis=1)
-            scales[layer] = tries[np.abs(found - wanted).argmin()]
+    scales = np.ones(len(coc))
+    if supersample > 1:
+        for layer, blur in enumerate(np.abs(coc).tolist()):
+            if blur < _MATCHED_PX:
+                scales[layer] = 0.0 if blur < _WINDOW_PX else _matched_scale(round(blur, 3), aperture, antialias)
     return scales
 
 
-def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
-    """All rays, and how many of them each layer asks for.
+@cache
+def _matched_scale(coc: float, aperture: Aperture, antialias: bool) -> float:
+    points = _points(aperture)
+    tries = np.linspace(0.0, 1.2, 241)
+    wanted = coc**2 * points.var(axis=0).mean() + (0.0 if antialias else -1.0 / 12.0)
+    found = np.floor(coc * tries[:, None, None] * points + 0.5).var(axis=1).mean(axis=1)
+    return float(tries[np.abs(found - wanted).argmin()])
+
+
+@lru_cache(32)
+def ray_sets(method: Multiview, aperture: Aperture, groups: int) -> RaySets:
+    """All rays, in so many groups of neighbours.
 
     The first set has one ray, for cells in focus; powers of two below ``rays`` follow when adaptive; then come ``rays``
     and, for bright light, more. With jitter there are 16 patterns of each.
     """
-    groups = max(1, layers.eyes)  # every one has rays in every set
-    counts = [groups]
+    counts = [groups]  # every group has rays in every set
     if method.adaptive:
         counts += [1 << n for n in range(2, 10) if groups < 1 << n < method.rays]
     counts.append(method.rays)
@@ -459,24 +611,18 @@ def ray_sets(method: Multiview, layers: LensLayers) -> RaySets:
     first = 0
     for count in counts:
         for pattern in range(patterns):
-            on_lens = _on_lens(method, layers.aperture, count, pattern)
+            on_lens = _on_lens(method, aperture, count, pattern)
             order, sizes = _grouped(on_lens, groups)
             ends = first + np.cumsum(sizes)
             ranges.append(np.stack([ends - sizes, sizes], axis=1))
             # The ray through lens point v meets C at p + C * (-v.x, v.y), y down.
             points.append(on_lens[order] * (-1.0, 1.0))
             first += count
-    on_lens = _on_lens(method, layers.aperture, method.rays, 0)
+    on_lens = _on_lens(method, aperture, method.rays, 0)
     order, sizes = _grouped(on_lens, groups)
     eyes = np.array([part.mean(axis=0) for part in np.split(on_lens[order], np.cumsum(sizes)[:-1])])
-    blur = layers.largest if method.halvings(layers) else np.abs(layers.coc)
-    needs = np.full((layers.total, 2), usual)
-    if method.adaptive:
-        wanted = _RAYS_PER_PX2 * math.pi * (blur + 0.5) ** 2
-        needs[:] = np.minimum(np.maximum(np.searchsorted(counts[: usual + 1], wanted), 1), usual)[:, None]
-    needs[blur >= _BRIGHT_PX, 1] = len(counts) - 1
     stacked = np.stack(ranges, axis=1).astype(np.int32)
-    return RaySets(stacked, np.concatenate(points).astype(np.float32), needs.astype(np.int32), eyes)
+    return RaySets(stacked, np.concatenate(points).astype(np.float32), tuple(counts), usual, eyes)
 
 
 def _on_lens(method: Multiview, aperture: Aperture, count: int, pattern: int) -> NDArray[np.float64]:
@@ -536,7 +682,7 @@ class _Builder:
         self.lens = (Param("c1", _FLOAT), Param("c0", _FLOAT))
         self.stride = _JITTER if method.jitter else 1
         self.peeled = method.traversal == "peels"
-        self.halvings = method.halvings(layers)
+        self.halvings = layers.halvings
         self.defines = (
             ("MULTIVIEW_VOID", int(not shape.is_opaque)),
             ("MULTIVIEW_STRIDE", self.stride),
@@ -567,66 +713,55 @@ class _Builder:
             self.buffers.append(Buffer("layers", slots * self.layer_bytes))
 
     def build(self) -> FrameProgram:
-        windows: list[Cone | None] = [None] * self.layers.total
-        if self.factor > 1 or self.method.has_cones:
-            rays = self.method.rays if self.method.has_cones else 0
-            windows = cones(self.layers, rays, self.factor, self.method.antialias)
-        sets = ray_sets(self.method, self.layers)
-        scales = shift_scales(self.layers, self.factor, self.method.antialias)
-        self._classify(windows, sets, scales)
+        sets = ray_sets(self.method, self.layers.aperture, max(1, self.layers.eyes))
+        self._classify()
         if self.layers.eyes:
             split, made = split_pass(self.shape, self.is_cpu)
             self.passes.append(split)
             peels = Buffer("view", self.shape.layers * self.shape.height * self.shape.width * 16)
             self.buffers += [*shading_inputs(self.shape), *made, peels]
-        if any(windows):
+        plain = range(*self.layers.plain)
+        if len(plain) < self.layers.total:
             self.buffers.append(Buffer("split", self.fine_bytes))
         self.buffers.append(Buffer("moments", self.layers.total * math.prod(self.fine_cells) * 16))
-        if self.peeled:
-            self._constant("bounds", self.layers.bounds)
-            if self.halvings:
-                self._constant("limits", self.layers.limits.astype(np.float32))
         for group, ranges in enumerate(sets.ranges):
             if self.layers.eyes:
                 self.passes.append(view_pass(self.shape, self.is_cpu, sets.eyes[group]))
             if group == 0 or not self.peeled:
-                self._split(windows)
+                self._split(plain)
             if not self.shape.is_opaque:
                 self._past()
             if group == 0:
-                self._choose(sets, scales)
+                self._choose(sets)
             self._trace(group, ranges)
         if self.layers.eyes:
             self._finish()
         return FrameProgram.of(self.buffers, self.passes)
 
-    def _classify(self, windows: list[Cone | None], rays: RaySets, scales: NDArray[np.float64]) -> None:
+    def _classify(self) -> None:
         """Which layers a cell can see."""
         shape = self.shape
+        self.buffers.append(Buffer("places", _PLACES.itemsize))
+        self._add("multiview_place", (write("places"), Param("given", _PLACES)), (1,))
         self._add(
             "multiview_extent",
-            (write("extent"), read("inv_depth"), self.fine, *self.lens),
+            (write("extent"), read("inv_depth"), self.fine, self.lens[0]),
             (shape.pitch // 16, shape.height, shape.layers),
             2 * self.peel_bytes,
         )
-        steps = struct_scalar(_STEPS, *self.layers.steps)
         self._add(
             "multiview_cells",
-            (write("nbuffer"), read("inv_depth"), read("extent"), self.fine, steps, *self.lens),
+            (write("nbuffer"), read("inv_depth"), read("extent"), self.fine, Param("steps", _STEPS)),
             self.fine_cells,
             2 * self.peel_bytes,
         )
         self._nbuffer("nbuffer")
-        self.farthest = np.abs(rays.points).max() * scales
-        moves = np.floor(self.farthest * self.layers.largest + 0.5) * self.factor
-        halos = np.array([max(-w.first, w.first + w.taps) + 1 if w else 0 for w in windows])
-        self._constant("reach", np.ceil((moves + halos) / CELL).astype(np.int32))
         self._add(
             "multiview_wanted",
             (
                 write("wanted"),
                 read("nbuffer"),
-                read("reach"),
+                read("places"),
                 self.fine,
                 self.size,
                 np.int32(self.levels),
@@ -639,21 +774,20 @@ class _Builder:
         for level in range(1, self.levels):
             self._add("multiview_nbuffer", (read_write(name), self.fine, np.int32(level)), self.fine_cells)
 
-    def _choose(self, rays: RaySets, scales: NDArray[np.float64]) -> None:
+    def _choose(self, rays: RaySets) -> None:
         """Where rays meet the layers, and how many rays a cell takes."""
-        nominal = self.layers.coc.astype(np.float32)
-        self._constant("nominal", nominal)
-        self.buffers.append(Buffer("coc", nominal.nbytes))
-        least = _CENTRED_PX if self.method.is_centred else _ENDLESS
-        args = (*(read(name) for name in ("moments", "nbuffer", "nominal")), self.fine, np.float32(least))
-        self._add("multiview_centres", (write("coc"), *args), (self.layers.total,))
+        self.buffers.append(Buffer("coc", self.layers.total * 4))
+        args = (*(read(name) for name in ("moments", "nbuffer", "places")), self.fine)
+        least, full = math.inf, math.inf
+        if self.method.is_centred:
+            least, full = _CENTRED_PX, _CENTRED_PX if self.layers.refined else _ALL_CENTRED_PX
+        self._add("multiview_centres", (write("coc"), *args, np.float32(least), np.float32(full)), (self.layers.total,))
         self.buffers.append(Buffer("bright", self.levels * math.prod(self.fine_cells) * 4))
         args = (read("moments"), read("nbuffer"), self.fine)
         self._add("multiview_bright", (write("bright"), *args), self.fine_cells)
         self._nbuffer("bright")
         count = len(rays.points)
         self._constant("points", rays.points)
-        self._constant("scale", scales.astype(np.float32))
         self.buffers.append(Buffer("shifts", count * self.layers.total * 8))
         self._add(
             "multiview_shifts",
@@ -661,16 +795,12 @@ class _Builder:
                 write("shifts"),
                 read("points"),
                 read("coc"),
-                read("scale"),
+                read("places"),
                 np.int32(self.layers.total),
                 np.int32(count),
             ),
             (self.layers.total, count),
         )
-        if self.halvings:
-            self._constant("farthest", self.layers.largest.astype(np.float32))
-        self._constant("moves", self.farthest.astype(np.float32))
-        self._constant("needs", rays.needs)
         self._add(
             "multiview_lists",
             (
@@ -678,58 +808,51 @@ class _Builder:
                 write("sets"),
                 read("nbuffer"),
                 read("bright"),
-                read("farthest" if self.halvings else "coc"),
-                read("reach"),
-                read("moves"),
-                read("needs"),
+                read("coc"),
+                read("places"),
                 self.fine,
                 self.size,
                 np.int32(self.levels),
                 np.int32(self.method.cull),
+                np.float32(rays.farthest),
                 np.float32(_STILL_PX if self.method.adaptive or self.layers.total == 1 else -1.0),
             ),
             self.cells,
         )
 
-    def _split(self, windows: list[Cone | None]) -> None:
+    def _split(self, plain: range) -> None:
         """Fill the layers, as cones see them; of peels, find only what C layers have."""
-        bounds = self.layers.bounds
-        for layer, window in enumerate(windows):
+        for layer in range(self.layers.total):
             stack = write("layers") if layer == 0 else read_write("layers")
             number = np.int32(layer)
-            target = stack if window is None else write("split")
+            target = stack if layer in plain else write("split")
             self._add(
                 "multiview_split",
                 (
                     *(() if self.peeled else (target,)),
                     write("moments") if layer == 0 else read_write("moments"),
                     read(self.color),
-                    *(read(name) for name in ("inv_depth", "extent", "nbuffer", "wanted")),
+                    *(read(name) for name in ("inv_depth", "extent", "nbuffer", "wanted", "places")),
                     self.fine,
                     np.int32(self.cells[0]),
                     *self.lens,
-                    bounds[layer],
-                    bounds[layer + 1],
                     number,
-                    number if window is None else np.int32(0),
+                    number if layer in plain else np.int32(0),
                 ),
                 self.fine_cells,
                 self.fine_bytes,
             )
-            if window is None:
+            if layer in plain:
                 continue
             self._add(
                 "multiview_cone",
                 (
                     stack,
-                    *(read(name) for name in ("split", "nbuffer", "wanted")),
+                    *(read(name) for name in ("split", "nbuffer", "wanted", "places")),
                     self.fine,
                     self.size,
                     number,
                     number,
-                    np.int32(window.first),
-                    np.int32(window.taps),
-                    np.float32(window.edge),
                 ),
                 (-(-self.pitch // _RUN), self.cells[1]),
                 self.fine_bytes + self.layer_bytes,
@@ -750,9 +873,9 @@ class _Builder:
         height, width = self.height - 2 * self.guard, self.width - 2 * self.guard
         peels: tuple[Any, ...] = ()
         if self.peeled:
-            peels = (*(read(name) for name in ("inv_depth", "extent", "bounds")), *self.lens)
+            peels = tuple(read(name) for name in ("inv_depth", "extent", "places"))
             if self.halvings:
-                peels = (*peels, read("limits"), read("points"))
+                peels = (*peels, read("points"), *self.lens)
         out = write("image")
         if self.layers.eyes:
             out = write("parts") if group == 0 else read_write("parts")

@@ -126,7 +126,8 @@ def boundaries(subject: Subject, frame: LayeredFrame, lens: Lens) -> list[float]
     elif subject.method == "pyramid":
         coc = [2.0 * subject.renderer.method._radius(i) for i in structure.indices]
     elif subject.method == "multiview":
-        coc = [*structure.bounds[1:-1], *structure.coc]
+        layers = subject.renderer.method.layering(frame, lens)
+        coc = [*layers.limits[1:-1], *layers.coc]
     else:
         coc = list(np.linspace(-9.0, 9.0, 10))
     depths = [lens.depth_of_coc_m(frame.camera, float(c)) for c in coc]

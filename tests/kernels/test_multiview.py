@@ -7,7 +7,7 @@ from cldof import Lens
 from cldof.host.device import Device
 from cldof.host.passes import Buffer, FrameProgram, Pass, Role, read, read_write, write
 from cldof.methods.base import row_pitch, struct_scalar
-from cldof.methods.multiview import _SIZE, _STEPS
+from cldof.methods.multiview import _PLACES, _SIZE, _STEPS, Cone
 from tests.frames import noise_frame
 from tests.oracles import multiview as oracle
 from tests.running import padded, run_pass, run_program
@@ -19,15 +19,21 @@ def size_of(width: int, height: int, peels: int = 1, layers: int = 32) -> np.gen
     return np.array((width, height, row_pitch(width), peels, layers, *cells), _SIZE)[()]
 
 
+def places(**values: float) -> np.ndarray:
+    """The same for all layers, 0 where nothing is said."""
+    out = np.zeros(1, _PLACES)
+    for name, value in values.items():
+        out[name] = value
+    return out
+
+
 def _lists(cells: tuple[int, int], levels: int, reach: int) -> FrameProgram:
     """From an N-buffer ``first`` to ``lists``."""
     nbytes = 4 * cells[0] * cells[1]
     constant = {
         "bright": np.zeros(levels * cells[0] * cells[1], np.uint32),
         "coc": np.zeros(32, np.float32),
-        "reach": np.full(32, reach, np.int32),
-        "moves": np.zeros(32, np.float32),
-        "needs": np.zeros((32, 2), np.int32),
+        "places": places(reach=reach),
     }
     buffers = [
         Buffer("first", levels * nbytes, Role.INPUT),
@@ -37,7 +43,17 @@ def _lists(cells: tuple[int, int], levels: int, reach: int) -> FrameProgram:
     ]
     inputs = [read("first"), *(read(name) for name in constant)]
     size = size_of(16 * cells[0], 16 * cells[1])
-    args = (write("lists"), write("sets"), *inputs, size, size, np.int32(levels), np.int32(1), np.float32(0.499))
+    args = (
+        write("lists"),
+        write("sets"),
+        *inputs,
+        size,
+        size,
+        np.int32(levels),
+        np.int32(1),
+        np.float32(1.0),
+        np.float32(0.499),
+    )
     return FrameProgram.of(buffers, [Pass("multiview", "multiview_lists", args, cells)])
 
 
@@ -49,13 +65,12 @@ def test_nbuffer_is_the_union_over_squares(device: Device, cells: tuple[int, int
     levels = max(cells).bit_length()
     width, height = 16 * across, 16 * down
     size, pitch = size_of(width, height), row_pitch(width)
-    inverse = padded(layer.astype(np.float32).repeat(16, 0).repeat(16, 1), pitch, -1.0)
+    inverse = padded((32.0 - layer.astype(np.float32)).repeat(16, 0).repeat(16, 1), pitch, -1.0)
     nbytes = levels * across * down * 4
-    # Layer k from C = k - 0.5 on: rounded ones of 1 px.
-    steps = struct_scalar(_STEPS, 1.0, 1.0, 0.5, 0.0)
-    lens = (steps, np.float32(1.0), np.float32(0.0))
+    # Layer k is half a unit around 32 - k.
+    steps = struct_scalar(_STEPS, 32.0, 1.0, 1.0, 0.0, 0.5)
     buffers = [Buffer("inv_depth", inverse.nbytes, Role.INPUT), Buffer("nbuffer", nbytes, Role.OUTPUT)]
-    args = (write("nbuffer"), read("inv_depth"), read("inv_depth"), size, *lens)
+    args = (write("nbuffer"), read("inv_depth"), read("inv_depth"), size, steps)
     passes = [Pass("multiview", "multiview_cells", args, cells)]
     for level in range(1, levels):
         args = (read_write("nbuffer"), size, np.int32(level))
@@ -85,11 +100,9 @@ def test_lists_hold_what_is_within_reach(device: Device, cells: tuple[int, int],
 
 
 @pytest.mark.parametrize("size", [(1, 1), (37, 21), (131, 67)])
-@pytest.mark.parametrize("window", [(0, 1, 0.3), (-2, 5, 0.75), (-13, 27, 1.0)])
+@pytest.mark.parametrize("half", [0.5, 1.3, 3.25, 14.0])
 @pytest.mark.parametrize("scale", [1, 2, 3])
-def test_cone_meets_the_oracle(
-    device: Device, size: tuple[int, int], window: tuple[int, int, float], scale: int
-) -> None:
+def test_cone_meets_the_oracle(device: Device, size: tuple[int, int], half: float, scale: int) -> None:
     width, height = size
     image = np.random.default_rng(2).random((height * scale, width * scale, 4), np.float32)
     pitch, fine_pitch = row_pitch(width), row_pitch(width * scale)
@@ -103,18 +116,17 @@ def test_cone_meets_the_oracle(
             padded(image, fine_pitch, 0.0),
             fine_cells,
             cells,
+            places(window=half),
             size_of(width * scale, height * scale),
             size_of(width, height),
             np.int32(2),
             np.int32(0),
-            np.int32(window[0]),
-            np.int32(window[1]),
-            np.float32(window[2]),
         ],
         (height, pitch, 4),
         (-(-pitch // 64), -(-height // 16)),
         defines=(("MULTIVIEW_SCALE", scale),),
     )
+    window = Cone.of(half, scale)[:3]
     assert_close(out[:, :width], oracle.cone(image.astype(np.float64), *window, scale), "multiview_cone")
 
 
@@ -129,9 +141,10 @@ def test_extent_meets_the_oracle(device: Device) -> None:
         device,
         "multiview",
         "multiview_extent",
-        [rows, size_of(75, 44, 3), np.float32(c1), np.float32(c0)],
+        [rows, size_of(75, 44, 3), np.float32(c1)],
         (3, 44, pitch),
         (pitch // 16, 44, 3),
     )
-    assert (out[..., 75:] == np.float32(-1e30)).all()
-    assert_close(out[..., :75], oracle.slots(inverse.astype(np.float64), c1, c0).far, "multiview_extent")
+    assert (out[..., 75:] == np.float32(1e30)).all()
+    far = oracle.slots(inverse.astype(np.float64), c1, c0).far
+    assert_close(out[..., :75] * c1 + c0, far, "multiview_extent")

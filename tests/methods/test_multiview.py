@@ -14,7 +14,7 @@ from cldof.host.device import Device
 from cldof.host.passes import FrameProgram
 from cldof.lens import GaussianAperture, PolygonAperture
 from cldof.methods import FrameShape
-from cldof.methods.multiview import _CENTRED_PX, MAX_LAYERS, Multiview, cones, ray_sets, shift_scales
+from cldof.methods.multiview import _ALL_CENTRED_PX, _CENTRED_PX, MAX_LAYERS, Multiview, ray_sets, shift_scales
 from tests.frames import noise_frame, plane_frame
 from tests.oracles import multiview as oracle
 from tests.running import inverse_depth, run_program
@@ -47,28 +47,28 @@ def plan_rays(program: FrameProgram) -> int:
 
 def twin(device: Device, frame: LayeredFrame, lens: Lens, **options) -> np.ndarray:
     method = Multiview(adaptive=False, **options)
-    layers = method.plan(frame, lens).structure
-    rays = ray_sets(method, layers)
+    layers = method.layering(frame, lens)
+    rays = ray_sets(method, lens.aperture, 1)
     first, count = next(each for each in rays.ranges[0] if each[1] == method.rays)
     factor = method.supersample
-    windows = [None] * layers.total
-    if factor > 1 or method.has_cones:
-        windows = cones(layers, method.rays if method.has_cones else 0, factor, method.antialias)
+    windows = [window and window[:3] for window in method.windows(layers, lens.aperture)]
+    full = _CENTRED_PX if layers.refined else _ALL_CENTRED_PX
     inverse = inverse_depth(device, frame)[..., : frame.width].astype(np.float64)
     return oracle.render(
         frame.color,
         inverse,
         *(value / factor for value in lens.coc_coefficients(frame.camera)),
-        layers.bounds.astype(np.float64),
-        layers.coc,
+        np.array([-1e20, *layers.limits[1:-1], 1e20]),
+        layers.met(rays.farthest),
         windows,
         rays.points[first : first + count].astype(np.float64),
-        shift_scales(layers, factor, method.antialias),
+        shift_scales(layers.coc, factor, lens.aperture, method.antialias),
         opaque=frame.is_opaque,
         guard=frame.guard_px // factor,
         scale=factor,
         least=_CENTRED_PX if method.is_centred else math.inf,
-        halvings=method.halvings(layers),
+        full=full if method.is_centred else math.inf,
+        halvings=method.halvings(layers.delta_px),
         limits=layers.limits,
     )
 
@@ -260,7 +260,7 @@ def test_rays_hit_what_dense_marching_hits(device: Device) -> None:
     """
     frame = hills()
     lens = Lens(12.0 / frame.camera.focal_px, 1.9)
-    layers = Multiview().plan(frame, lens).structure
+    layers = Multiview().layering(frame, lens)
     inverse = np.where(frame.color[..., 3] > 0, 1.0 / frame.depth.astype(np.float64), -1.0)
     columns = oracle.slots(inverse, *lens.coc_coefficients(frame.camera))
     # Pixels of which no ray leaves the frame.
@@ -299,7 +299,7 @@ def test_binary_search_hits_the_very_pixel(device: Device) -> None:
         exact = [oracle.march(oracle.Slots(*(end + move for end in columns)), point, 1 / 32) for move in moves]
         for layers, steps in ((32, 0), (32, 2), (8, 0), (8, 2)):
             options = {"traversal": "peels", "layers": layers, "refine_steps": steps}
-            reach = math.ceil(Multiview(**options).plan(frame, lens).structure.largest.max()) + 1
+            reach = math.ceil(Multiview(**options).layering(frame, lens).largest.max()) + 1
             image = render(device, frame, lens, one_ray=point, **options)
             peel, row, column = np.unravel_index(image[..., 0].astype(int), frame.depth.shape)
             coc = columns.near[peel, row, column]
@@ -326,7 +326,7 @@ def test_thin_layers_hit_as_often_as_false_position(device: Device, layers: int)
     """Looking once into each of many thin layers finds at least as many of the hits as the paper's search in them."""
     frame = hills()
     lens = Lens(12.0 / frame.camera.focal_px, 1.9)
-    plan = Multiview(layers=layers).plan(frame, lens).structure
+    plan = Multiview(layers=layers).layering(frame, lens)
     inverse = np.where(frame.color[..., 3] > 0, 1.0 / frame.depth.astype(np.float64), -1.0)
     columns = oracle.slots(inverse, *lens.coc_coefficients(frame.camera))
     reach = math.ceil(np.abs(plan.coc).max()) + 1
@@ -552,11 +552,12 @@ def test_layers_reach_the_coc_range() -> None:
     frame = noise_frame(40, 30)
     lens = Lens(4.0 / frame.camera.focal_px, 1.7)
     plan = Multiview().plan(frame, lens)
-    coc, delta = plan.structure.coc, plan.structure.delta_px
-    assert delta == 0.5
-    assert abs(coc[0] + plan.summary["largest_near_coc_px"]) <= delta
-    assert abs(coc[-1] - plan.summary["largest_far_coc_px"]) <= delta
-    assert coc[plan.structure.front] == 0.0
+    layers = Multiview().layering(frame, lens)
+    assert 0.25 < layers.delta_px <= 0.5
+    assert layers.limits[0] == pytest.approx(-plan.summary["largest_near_coc_px"])
+    assert layers.limits[-1] == pytest.approx(plan.summary["largest_far_coc_px"])
+    seen = lens.coc_radius_px(frame.camera, frame.depth[np.isfinite(frame.depth)])
+    assert layers.limits[0] == pytest.approx(seen.min(), abs=1e-4) and layers.limits[-1] >= seen.max()
     huge = Lens(5000.0 / frame.camera.focal_px, 1.7)
     assert Multiview().plan(frame, huge).structure.total <= MAX_LAYERS
     assert Multiview(layers=6).plan(frame, huge).structure.total <= 6

@@ -7,7 +7,7 @@ import pytest
 
 from cldof import Ambient, Environment, LayeredFrame, Lens, Lighting, Renderer
 from cldof.host.device import DeviceInfo
-from cldof.methods.multiview import Multiview, _layers, ray_sets
+from cldof.methods.multiview import Multiview, ray_sets
 from tests.shaded import LIGHTS, colored_frame, environment, mirrored_by, shaded_frame
 
 LENS = Lens(0.08, 1.5)
@@ -47,7 +47,7 @@ def test_in_focus_the_mean_over_the_eyes(device_info: DeviceInfo, lighting: Ligh
     method = Multiview(rays=32, eyes=8, **options)
     layers = method.plan(frame, LENS).structure
     assert layers.eyes == 8 and layers.total == 1
-    eyes = ray_sets(method, layers).eyes * LENS.aperture_radius_m
+    eyes = ray_sets(method, LENS.aperture, 8).eyes * LENS.aperture_radius_m
     expected = 0.5 + np.mean([mirrored_by(frame, eye)[0] for eye in eyes], axis=0)
     image = render(device_info, frame, eyes=8, **options)
     # Narrow lobes: see the tolerance of shading_split.
@@ -58,7 +58,7 @@ def test_in_focus_the_mean_over_the_eyes(device_info: DeviceInfo, lighting: Ligh
 def test_eyes_fill_the_lens() -> None:
 
     method = Multiview(rays=64, eyes=16, highlights=False)
-    rays = ray_sets(method, _layers(10.0, 10.0, 0.5, 32, LENS.aperture)._replace(eyes=16))
+    rays = ray_sets(method, LENS.aperture, 16)
     points = LENS.aperture.samples(64, 0)
     assert rays.ranges.shape[0] == 16 and (rays.ranges[..., 1] >= 1).all()
     assert (rays.ranges[:, -1, 1] == 4).all()

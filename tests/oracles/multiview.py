@@ -47,8 +47,13 @@ def split(color: np.ndarray, columns: Slots, bounds: np.ndarray) -> np.ndarray:
     return layers
 
 
-def centres(color: np.ndarray, columns: Slots, bounds: np.ndarray, nominal: np.ndarray, least: float) -> np.ndarray:
-    """C at which each layer is met: the mean of what begins and is seen in it, weighted by the square of its light."""
+def centres(
+    color: np.ndarray, columns: Slots, bounds: np.ndarray, nominal: np.ndarray, least: float, full: float
+) -> np.ndarray:
+    """C at which each layer is met: the mean of what begins and is seen in it, weighted by the square of its light.
+
+    From a blur of ``full`` px on; below ``least`` px it is the layer's own, in between something between both.
+    """
     coc = nominal.copy()
     for layer, (low, high) in enumerate(pairwise(bounds)):
         covered = np.zeros(color.shape[1:3])
@@ -61,8 +66,10 @@ def centres(color: np.ndarray, columns: Slots, bounds: np.ndarray, nominal: np.n
             weight += pull.sum()
             is_in = np.where(rgba[..., 3] >= 0.998, reaches, begins)
             covered += rgba[..., 3] * (1.0 - covered) * is_in
-        if weight > 0.0 and abs(nominal[layer]) >= least:
-            coc[layer] = total / weight
+        away = abs(nominal[layer])
+        if weight > 0.0 and away >= least:
+            share = 1.0 if away >= full else (away - least) / (full - least)
+            coc[layer] += share * (total / weight - coc[layer])
     return coc
 
 
@@ -224,6 +231,7 @@ def render(
     guard: int = 0,
     scale: int = 1,
     least: float = 0.0,
+    full: float = 0.0,
     halvings: int = 0,
     limits: np.ndarray | None = None,
 ) -> np.ndarray:
@@ -233,7 +241,7 @@ def render(
     """
     color = color.astype(np.float64)
     columns = slots(inverse_depth, c1, c0, scale)
-    coc = centres(color, columns, bounds, nominal, least)
+    coc = centres(color, columns, bounds, nominal, least, full)
     inner = slice(guard, -guard or None)
     if halvings:
         image = trace_peels(color, columns, bounds, limits, points, halvings, None if opaque else past(color))

@@ -102,7 +102,7 @@ def test_highlights(device_info: DeviceInfo) -> None:
     assert np.unravel_index(spread.argmax(), spread.shape) == (0, 1, 2)
     assert np.sort(spread, axis=None)[-2:] == pytest.approx([0.5 * area, 100.0 * area], rel=1e-5)
     with Renderer("multiview", device=device_info.index) as renderer:
-        lit, dim = (renderer.render(frame, lens_for(frame, coc, 3.0)).plan for coc in (12.0, 1.0))
+        lit, dim = (renderer.render(frame, lens_for(frame, coc, 3.0)).plan for coc in (12.0, 2.5))
     assert decision(lit, "more rays for lights").kept
     assert "100" in decision(lit, "more rays for lights").reason
     assert not decision(dim, "more rays for lights").kept
