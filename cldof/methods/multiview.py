@@ -79,6 +79,8 @@ _WINDOW_PX, _MATCHED_PX = 0.8, 4.0
 # Layers nearer to the focus are met in their middle: there whole pixels of shift blur more than they should. Those that
 # stand still in the scene go over to the mean as far as the second figure.
 _CENTRED_PX, _ALL_CENTRED_PX = 0.8, 1.2
+# Layers that stand still in the scene are in focus where their middle is within half of their growth and this.
+_FOCUS_PX = 0.125
 # Rays that move by less all stay in their pixel.
 _STILL_PX = 0.499
 # Light above this (constant of kernels/multiview.cl) that is blurred by so many px gets so many times the rays.
@@ -86,8 +88,9 @@ _BRIGHT, _BRIGHT_PX, _BRIGHT_RAYS = 1.5, 1.5, 4
 # Binary search in peels pays where layers grow by more than this: twice. Below, as many rays as take the same time gain
 # more.
 _COARSE_PX, _USUAL_HALVINGS = 2.0, 2
-# Rays per px^2 of the largest circle of confusion that a cell can see: more are not traced. Costs up to 0.2 dB.
-_RAYS_PER_PX2 = 1.0
+# Rays per px^2 of the largest circle of confusion that a cell can see: more are not traced. Costs up to 0.2 dB. As soon as
+# rays move at all there are so many, since each that moves to the next pixel is a step when the focus moves.
+_RAYS_PER_PX2, _FEWEST_RAYS_LOG2 = 4.0, 5
 # Pixels of the jitter pattern along x and y, and the order in which Bayer 1973 fills the pattern: row by row.
 _JITTER = 4
 _BAYER = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
@@ -218,18 +221,20 @@ class Layering(NamedTuple):
         limits = np.abs(self.limits)
         return np.maximum(limits[1:], limits[:-1])
 
-    def met(self, farthest: float) -> NDArray[np.float64]:
-        """C in px at which layers are met, (K,): in their middle, but what is in focus stays where it is.
+    def met(self, farthest: float, aperture: Aperture) -> NDArray[np.float64]:
+        """C in px at which layers are met, (K,): in their middle, less what whole pixels of shift blur by themselves.
 
-        Rays move by up to ``farthest`` px per px of C. Where half a layer is more than a ray may move and be rounded to
-        nothing, blur grows from nothing at that distance, and catches up with C at twice of it.
+        Rays move by up to ``farthest`` px per px of C. What is in focus stays where it is, and so do layers whose middle
+        is no farther from it than half a layer: from there on blur grows from nothing.
         """
         coc = self.coc
-        half, still = self.delta_px / 2.0, _STILL_PX / max(farthest, 1e-6)
-        if self.refined or half <= still:
+        if self.refined:
             return coc
-        away = np.abs(coc)
-        eased = np.where(away < 2.0 * half, np.interp(away, (0.0, half, 2.0 * half), (0.0, still, 2.0 * half)), away)
+        away, least = np.abs(coc), self.delta_px / 2.0 + _FOCUS_PX
+        rounding = 1.0 / (12.0 * float(_points(aperture).var(axis=0).mean()))
+        joint = max(1.0, 2.0 * least, math.sqrt(2.0 * rounding))
+        knots = (0.0, least, joint), (0.0, _STILL_PX / max(farthest, 1e-6), math.sqrt(joint**2 - rounding))
+        eased = np.where(away < joint, np.interp(away, *knots), np.sqrt(np.maximum(away**2 - rounding, 0.0)))
         return np.asarray(np.sign(coc) * eased)
 
 
@@ -418,7 +423,7 @@ class Multiview:
             eyes = min(self.eyes, self.rays)
         halvings = self.halvings(where.delta_px)
         rays = ray_sets(self, lens.aperture, max(1, eyes))
-        met, largest = where.met(rays.farthest), where.largest
+        met, largest = where.met(rays.farthest, lens.aperture), where.largest
         windows = self.windows(where, lens.aperture)
         scales = shift_scales(where.coc, self.supersample, lens.aperture, self.antialias)
         moves = np.floor(rays.farthest * scales * (largest + 1e-3) + 0.5) * self.supersample
@@ -601,7 +606,7 @@ def ray_sets(method: Multiview, aperture: Aperture, groups: int) -> RaySets:
     """
     counts = [groups]  # every group has rays in every set
     if method.adaptive:
-        counts += [1 << n for n in range(2, 10) if groups < 1 << n < method.rays]
+        counts += [1 << n for n in range(_FEWEST_RAYS_LOG2, 10) if groups < 1 << n < method.rays]
     counts.append(method.rays)
     usual = len(counts) - 1
     if method.highlights and method.rays > 1:

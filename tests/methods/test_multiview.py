@@ -59,7 +59,7 @@ def twin(device: Device, frame: LayeredFrame, lens: Lens, **options) -> np.ndarr
         inverse,
         *(value / factor for value in lens.coc_coefficients(frame.camera)),
         np.array([-1e20, *layers.limits[1:-1], 1e20]),
-        layers.met(rays.farthest),
+        layers.met(rays.farthest, lens.aperture),
         windows,
         rays.points[first : first + count].astype(np.float64),
         shift_scales(layers.coc, factor, lens.aperture, method.antialias),
