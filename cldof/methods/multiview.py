@@ -88,9 +88,9 @@ _BRIGHT, _BRIGHT_PX, _BRIGHT_RAYS = 1.5, 1.5, 4
 # Binary search in peels pays where layers grow by more than this: twice. Below, as many rays as take the same time gain
 # more.
 _COARSE_PX, _USUAL_HALVINGS = 2.0, 2
-# Rays per px^2 of the largest circle of confusion that a cell can see: more are not traced. Costs up to 0.2 dB. As soon as
-# rays move at all there are so many, since each that moves to the next pixel is a step when the focus moves.
-_RAYS_PER_PX2, _FEWEST_RAYS_LOG2 = 4.0, 5
+# Rays per px^2 of the largest circle of confusion that a cell can see: more are not traced. Costs up to 0.2 dB. Where
+# rays move at all there are at least 64: each that moves on by a pixel is a step when the focus moves.
+_RAYS_PER_PX2, _FEWEST_RAYS_LOG2 = 4.0, 6
 # Pixels of the jitter pattern along x and y, and the order in which Bayer 1973 fills the pattern: row by row.
 _JITTER = 4
 _BAYER = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
@@ -224,8 +224,8 @@ class Layering(NamedTuple):
     def met(self, farthest: float, aperture: Aperture) -> NDArray[np.float64]:
         """C in px at which layers are met, (K,): in their middle, less what whole pixels of shift blur by themselves.
 
-        Rays move by up to ``farthest`` px per px of C. What is in focus stays where it is, and so do layers whose middle
-        is no farther from it than half a layer: from there on blur grows from nothing.
+        Rays move by up to ``farthest`` px per px of C. What is in focus stays where it is, and so does all of a layer
+        whose middle is no farther from it than half a layer: from there on blur grows from nothing.
         """
         coc = self.coc
         if self.refined:
