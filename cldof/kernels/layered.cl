@@ -451,6 +451,7 @@ static inline void layered_finish_quad(__global float *out, float16 v, LayeredSi
     float4 coverage = v.s37bf;
     float4 scale = coverage > LAYERED_MIN_COVERAGE ? 1.0f / coverage : (float4)(0.0f);
     v = v * spread(scale);
+    v = v > 0.0f ? v : (float16)(0.0f); /* "over" takes a rounding from what is behind coverage of 1 and a rounding */
 #if LAYERED_ALPHA_RUN
     float alpha[4] = {v.s0, v.s4, v.s8, v.sc};
     for (int i = 0; i < 4; i++)

@@ -86,6 +86,11 @@ LAMP = Scene(5, 3, 3, 2, [(1e-3, 1e6, 0.0, 1.0 / 255.0), (math.inf, 1e-8, 0.0, 0
 # Two surfaces a rounding apart, at focus and not.
 FIGHTING = Scene(31, 17, 2, 0, [(1.0, 1.0, 0.0, 1.0), (1.0000001, 0.0, 1.0, 1.0), (1e6, 0.5, 0.5, 1.0)], 1, 3)
 
+# Found: coverage of 1 and a rounding before faint light, of which "over" left less than nothing.
+FAINT = Scene(
+    4, 1, 2, 0, [(1e-3, 0.0, 0.0, 0.0), (0.5, 0.0, 1e-8, 0.0), (1e-3, 0.0, 0.0, 1.0), (1e-3, 0.0, 0.0, 0.0)], 1, 0
+)
+
 # Found: four panes before one another, of which the light field keeps two apart.
 FOUR_PANES = Scene(1, 1, 4, 0, [(1e-3, 0.0, 0.0, 1.0 / 255.0), (math.inf, 0.0, 0.5, 1.0 / 255.0)], 1, 0)
 
@@ -105,6 +110,7 @@ def lens_of(frame: LayeredFrame, coc_px: float, focus_m: float) -> Lens:
 @example(scene=FIGHTING, coc_px=0.5, focus_m=1.0)
 @example(scene=FOUR_PANES, coc_px=0.0, focus_m=1e-3)
 @example(scene=PANES_AT_INFINITY, coc_px=0.0, focus_m=1e-3)
+@example(scene=FAINT, coc_px=0.25, focus_m=1.0)
 def test_promises(method: Subject, opaque: bool, scene: Scene, coc_px: float, focus_m: float) -> None:
     frame = scene.frame(opaque)
     keep_promises(method, "random frames", frame, method.render(frame, lens_of(frame, coc_px, focus_m)))
