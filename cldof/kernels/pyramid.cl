@@ -54,11 +54,14 @@ typedef struct {
 } PyramidSize;
 
 /* Matting functions, per sub-image (up scale, up offset, down scale, down offset): with t the inverse depth, or the
- * depth if PYRAMID_PAPER, clamp(t * scale + offset, 0, 1) is the front and the back ramp. `seam`: per unit of slope
- * (1/m per px), the part of the front ramp that a surface needs to close the seam to the sub-image before. */
+ * depth if PYRAMID_PAPER, clamp(t * scale + offset, 0, 1) is the front and the back ramp. `before`: the back ramp of the
+ * sub-image before, zeros for the first. `seam`: per unit of slope (1/m per px), the part of the front ramp that a
+ * surface needs to close the seam to the sub-image before. `around`: px, about one sigma of the blur. */
 typedef struct {
     float4 ramp[PYRAMID_COUNT];
+    float2 before[PYRAMID_COUNT];
     float seam[PYRAMID_COUNT];
+    int around[PYRAMID_COUNT];
 } PyramidMatting;
 
 /* pyramid_matting: the frame's matting functions as a buffer. Mesa 22.3 ends the process in kernels that take a struct
@@ -66,6 +69,19 @@ typedef struct {
  * writes  matting  PyramidMatting
  * range   1-D, one item */
 __kernel void pyramid_matting(__global PyramidMatting *matting, PyramidMatting given) { *matting = given; }
+
+/* What one sub-image needs of that. */
+typedef struct {
+    float4 ramp;
+    float2 before;
+    float seam;
+} PyramidRamps;
+
+static inline PyramidRamps ramps_of(const __global PyramidMatting *matting, int i)
+{
+    PyramidRamps ramps = {matting->ramp[i], matting->before[i], matting->seam[i]};
+    return ramps;
+}
 
 typedef float8 __attribute__((aligned(4))) float8_unaligned;
 
@@ -148,12 +164,53 @@ static inline float16 least_step(float16 w, float16 a, float16 b)
     return to_a < MAXFLOAT ? to_a : (float16)(0.0f);
 }
 
+/* Slots x .. x+15 of a row; beyond its ends the row repeats its last slot. */
+static inline float16 row_of_slots(const __global float *row, int x, int width)
+{
+    if (x >= 0 && x + 16 <= width) return load_quad(row + x);
+    float v[16];
+    for (int i = 0; i < 16; i++) v[i] = row[clamp_index(x + i, width - 1)];
+    return (float16)(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14],
+                     v[15]);
+}
+
+/* How many of two opposite slots belong to the surface of the slot w between them, or hide it: those that are not
+ * farther by more than `step`, or lie on a plane through the three. */
+static inline float16 count_pair(float16 w, float16 a, float16 b, float step)
+{
+    const float16 zero = (float16)(0.0f), one = (float16)(1.0f);
+    float16 a_nearer = a > w ? a - w : zero, b_nearer = b > w ? b - w : zero;
+    return (a >= 0.0f && a >= w - b_nearer - step ? one : zero) + (b >= 0.0f && b >= w - a_nearer - step ? one : zero);
+}
+
+/* Share of the surroundings that belong to the surface of each of 16 slots; as in layered.cl. */
+static inline float16 breadth(const __global float *inv, float16 w, PyramidSize size, int far, float step, int x, int y)
+{
+    const int near = far * 7 / 10 > 1 ? far * 7 / 10 : 1, last = size.height - 1;
+    const __global float *here = inv + (size_t)y * size.pitch;
+    const __global float *up = inv + (size_t)clamp_index(y - near, last) * size.pitch;
+    const __global float *down = inv + (size_t)clamp_index(y + near, last) * size.pitch;
+    const __global float *top = inv + (size_t)clamp_index(y - far, last) * size.pitch;
+    const __global float *bottom = inv + (size_t)clamp_index(y + far, last) * size.pitch;
+    float16 found = count_pair(w, row_of_slots(here, x - far, size.width), row_of_slots(here, x + far, size.width), step);
+    found += count_pair(w, load_quad(top + x), load_quad(bottom + x), step);
+    found += count_pair(w, row_of_slots(up, x - near, size.width), row_of_slots(down, x + near, size.width), step);
+    found += count_pair(w, row_of_slots(up, x + near, size.width), row_of_slots(down, x - near, size.width), step);
+    return found * 0.125f;
+}
+
 /* pyramid_slope: change of inverse depth from one pixel to the next, the lesser of both sides, so that a silhouette
- * does not count as a slope, and the greater of both directions.
+ * does not count as a slope, and the greater of both directions; and how much of a visible surface is left around it
+ * when it is blurred.
  * reads   flat_inv  float[sources][height][pitch]  1/m
+ *         matting   PyramidMatting
  * writes  slope     float[sources][height][pitch]  1/m per px; 0 where no neighbour is known; anything in holes
+ *         broad     float[height][pitch]  share of eight pixels one sigma around that belong to the surface of source 0
+ *                   or hide it; 1 in front of the first sub-image and behind the last
  * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th block */
-__kernel void pyramid_slope(__global float *restrict slope, const __global float *restrict flat_inv, PyramidSize size)
+__kernel void pyramid_slope(__global float *restrict slope, __global float *restrict broad,
+                            const __global float *restrict flat_inv, const __global PyramidMatting *restrict matting,
+                            PyramidSize size, int count)
 {
     const int row = get_global_id(1), y = row % size.height;
     for (int x = 16 * get_global_id(0); x < size.pitch; x += 16 * get_global_size(0)) {
@@ -166,6 +223,17 @@ __kernel void pyramid_slope(__global float *restrict slope, const __global float
         float16 below = y + 1 < size.height ? load_quad(inv + size.pitch) : none;
         float16 across = least_step(w, left, right), down = least_step(w, above, below);
         store_quad(slope + (size_t)row * size.pitch + x, across > down ? across : down);
+        if (row >= size.height) continue;
+        float16 share = (float16)(1.0f);
+        for (int i = 0; i < count; i++) {
+            const float2 before = matting->before[i];
+            if (before.x == 0.0f) continue;
+            float16 rest = w * before.x + before.y;
+            int16 is_own = (rest > 0.0f) & (rest <= 1.0f) & (w >= 0.0f);
+            if (sum16(is_own ? (float16)(1.0f) : (float16)(0.0f)) == 0.0f) continue;
+            share = is_own ? breadth(flat_inv, w, size, matting->around[i], 1.0f / before.x, x, y) : share;
+        }
+        store_quad(broad + (size_t)row * size.pitch + x, share);
     }
 }
 
@@ -180,17 +248,35 @@ static inline float16 matting_axis(float16 w)
 #endif
 }
 
-/* Front ramp. Where it is 0 the pixel is culled as foreground. */
-static inline float16 matting_rise(float16 w, float16 slope, float4 ramp, float seam)
+/* Front ramp. Where it is 0 the pixel is culled as foreground.
+ *
+ * A pixel that is 1 - t in the sub-image before and t past it takes its full weight here where its surface is broad, or
+ * what is behind would show through, and only a share where it is thin: of what blurs to little both would add up to
+ * more than there is. With b the breadth, t / (1 - (1 - t) b) is right for both. It enters earlier where it slopes, as
+ * far as the blur opens a seam, and is broad; what crosses the whole ramp between two pixels is a silhouette. Slope and
+ * breadth are read where they count; 0 stands for no slope, and for broad. */
+static inline float16 matting_rise(float16 w, const __global float *slope, const __global float *broad,
+                                   PyramidRamps ramps)
 {
-    float16 rising = matting_axis(w) * ramp.x + ramp.y;
+    float16 rising = matting_axis(w) * ramps.ramp.x + ramps.ramp.y;
 #if !PYRAMID_PAPER
-    float16 between = rising > 0.0f && rising < 1.0f ? (float16)(1.0f) : (float16)(0.0f);
+    const float16 zero = (float16)(0.0f), one = (float16)(1.0f);
+    float16 rest = w * ramps.before.x + ramps.before.y; /* 1 - t */
+    rest = rising >= 1.0f && rest > 0.0f ? (rest > 1.0f ? one : rest) : zero;
+    float16 between = rising > 0.0f && rising < 1.0f ? one : zero;
     if (sum16(between) > 0.0f) {
-        float16 needed = slope * seam;
-        needed = needed > 1.0f ? (float16)(1.0f) : needed;
+        float16 needed = slope ? load_quad(slope) : zero;
+        needed = needed > -1.0f / ramps.ramp.x ? zero : needed * ramps.seam;
+        needed = needed > 1.0f ? one : needed;
         needed = needed < 1e-3f ? (float16)(1e-3f) : needed;
-        rising = (rising - 1.0f) / needed + 1.0f;
+        float16 early = clamp01((rising - 1.0f) / needed + 1.0f);
+        if (broad && sum16(early * between) > 0.0f) early *= clamp01(2.0f * load_quad(broad) - 1.0f);
+        rising = rising < 1.0f ? early : rising;
+    }
+    if (broad && sum16(rest) > 0.0f) {
+        float16 others = 1.0f - rest * load_quad(broad);
+        float16 own = others > 1e-3f ? (1.0f - rest) / others : one;
+        rising = rest > 0.0f ? own : rising;
     }
 #endif
     return w < 0.0f ? (float16)(0.0f) : clamp01(rising);
@@ -205,7 +291,8 @@ static inline float16 matting_fall(float16 w, float4 ramp) { return clamp01(matt
  * of all 16, -1 if all are culled, MIXED if they differ. */
 #define MIXED (-2)
 static inline float16 cull(float16 *from, int *only, float16 *inverse, const __global float *flat_inv,
-                           const __global float *slope, PyramidSize size, float4 ramp, float seam, int x, int y)
+                           const __global float *slope, const __global float *broad, PyramidSize size,
+                           PyramidRamps ramps, int x, int y)
 {
     float16 rise = (float16)(0.0f), w = (float16)(EMPTY), source = (float16)(-1.0f);
     if (x >= 0 && x < size.pitch && y >= 0 && y < size.height) {
@@ -213,9 +300,9 @@ static inline float16 cull(float16 *from, int *only, float16 *inverse, const __g
             const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
             float16 ws = load_quad(flat_inv + at);
 #if PYRAMID_PAPER
-            float16 r = matting_rise(ws, (float16)(0.0f), ramp, seam);
+            float16 r = matting_rise(ws, 0, 0, ramps);
 #else
-            float16 r = matting_rise(ws, load_quad(slope + at), ramp, seam);
+            float16 r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
 #endif
             int16 take = (rise <= 0.0f) & (r > 0.0f);
             w = take ? ws : w;
@@ -265,30 +352,30 @@ static inline void pull_quad(__global float *color, __global float *inv, float16
 
 /* pyramid_cull: culls a sub-image's foreground and pulls level 1 from what is left.
  * source  sections 3.1 and 3.2; Strengert et al. 2006
- * reads   flat, flat_inv, slope  the stack of RGBZ images
+ * reads   flat, flat_inv, slope, broad  the stack of RGBZ images
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  fill      float[][4]  level 1 of all sub-images, up to the pitch
  *         fill_inv  float[]
  * range   3-D: (items per row, sub-images, rows of level 1 of the largest sub-image), any local size */
 __kernel void pyramid_cull(__global float *restrict fill, __global float *restrict fill_inv,
                            const __global float *restrict flat, const __global float *restrict flat_inv,
-                           const __global float *restrict slope, const __global int4 *restrict table,
-                           const __global PyramidMatting *restrict matting, PyramidSize size)
+                           const __global float *restrict slope, const __global float *restrict broad,
+                           const __global int4 *restrict table, const __global PyramidMatting *restrict matting,
+                           PyramidSize size)
 {
     const int i = get_global_id(1);
     const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
     const int row = (int)get_global_id(2) - (size.top - sub.x) / 2;
     if (row < 0 || row >= level.z) return;
-    const float4 ramp = matting->ramp[i];
-    const float seam = matting->seam[i];
+    const PyramidRamps ramps = ramps_of(matting, i);
     const int y = 2 * row - sub.x;
     for (int b = get_global_id(0); b < level.w / 8; b += get_global_size(0)) {
         const int x = 16 * b - sub.x;
         const size_t to = (size_t)level.x + (size_t)row * level.w + 8 * b;
         float16 from[2], w[2];
         int only[2];
-        cull(&from[0], &only[0], &w[0], flat_inv, slope, size, ramp, seam, x, y);
-        cull(&from[1], &only[1], &w[1], flat_inv, slope, size, ramp, seam, x, y + 1);
+        cull(&from[0], &only[0], &w[0], flat_inv, slope, broad, size, ramps, x, y);
+        cull(&from[1], &only[1], &w[1], flat_inv, slope, broad, size, ramps, x, y + 1);
         if (only[0] == -1 && only[1] == -1) {
             store_quad(fill + to * 4, (float16)(0.0f));
             store_quad(fill + to * 4 + 16, (float16)(0.0f));
@@ -428,19 +515,19 @@ __kernel void pyramid_push(__global float *restrict fill, __global float *restri
 
 /* 16 pixels of a sub-image's level 0: culled, disoccluded and weighted. Returns 0 if nothing is there. */
 static inline int matted_block(float16 quad[4], const __global float *flat, const __global float *flat_inv,
-                               const __global float *slope, const __global float *fill,
-                               const __global float *fill_inv, int4 sub, int4 level, PyramidSize size, float4 ramp,
-                               float seam, int x, int y)
+                               const __global float *slope, const __global float *broad,
+                               const __global float *fill, const __global float *fill_inv, int4 sub, int4 level,
+                               PyramidSize size, PyramidRamps ramps, int x, int y)
 {
     float16 from, w;
     int only;
-    float16 weight = cull(&from, &only, &w, flat_inv, slope, size, ramp, seam, x, y) * matting_fall(w, ramp);
+    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, size, ramps, x, y) * matting_fall(w, ramps.ramp);
     float16 filled = (float16)(0.0f); /* weight of holes */
     float holes = 0.0f;
     const Between rows = between(level, y + sub.x);
     if (only != 0) {
         float16 v = expand_depth(fill_inv, rows, (x + sub.x) / 2);
-        filled = matting_rise(v, (float16)(0.0f), ramp, seam) * matting_fall(v, ramp);
+        filled = matting_rise(v, 0, 0, ramps) * matting_fall(v, ramps.ramp);
         filled = w < 0.0f ? filled : (float16)(0.0f);
         holes = sum16(filled);
     }
@@ -477,7 +564,7 @@ static inline float16 box_quad(float16 a, float16 b, float16 c)
 
 /* pyramid_matte: level 0 of a sub-image, matted, and reduced to level 1 in the same breath.
  * source  sections 3.3 and 3.4
- * reads   flat, flat_inv, slope  the stack of RGBZ images
+ * reads   flat, flat_inv, slope, broad  the stack of RGBZ images
  *         fill, fill_inv  level 1 without holes
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  blur  float[][4]  level 1 of all sub-images that have steps
@@ -485,15 +572,15 @@ static inline float16 box_quad(float16 a, float16 b, float16 c)
  * local   lines  float[2][2 * segment + 32][4]  sums of two rows of level 0, from 16 px before the segment on */
 __kernel void pyramid_matte(__global float *restrict blur, const __global float *restrict flat,
                             const __global float *restrict flat_inv, const __global float *restrict slope,
-                            const __global float *restrict fill, const __global float *restrict fill_inv,
-                            const __global int4 *restrict table, const __global PyramidMatting *restrict matting,
-                            PyramidSize size, int segment, __local float *restrict lines)
+                            const __global float *restrict broad, const __global float *restrict fill,
+                            const __global float *restrict fill_inv, const __global int4 *restrict table,
+                            const __global PyramidMatting *restrict matting, PyramidSize size, int segment,
+                            __local float *restrict lines)
 {
     const int lid = get_local_id(0), items = get_local_size(0);
     const int i = get_group_id(1);
     const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
-    const float4 ramp = matting->ramp[i];
-    const float seam = matting->seam[i];
+    const PyramidRamps ramps = ramps_of(matting, i);
     const int line_width = 2 * segment + 32;
     const int x0 = (int)get_group_id(0) * segment;
     const int first = 2 * x0 - 16; /* level 0 pixel at the start of a line */
@@ -509,9 +596,9 @@ __kernel void pyramid_matte(__global float *restrict blur, const __global float 
                 const int x = first + 16 * b;
                 if (x < 0 || x >= sub.z) continue;
                 float16 sum[4], quad[4];
-                matted_block(sum, flat, flat_inv, slope, fill, fill_inv, sub, level, size, ramp, seam, x - sub.x,
+                matted_block(sum, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x - sub.x,
                              clamp_index(2 * row - 1, sub.w - 1) - sub.x);
-                matted_block(quad, flat, flat_inv, slope, fill, fill_inv, sub, level, size, ramp, seam, x - sub.x,
+                matted_block(quad, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x - sub.x,
                              clamp_index(2 * row, sub.w - 1) - sub.x);
 #pragma unroll
                 for (int q = 0; q < 4; q++) store_quad_local(line + (16 * b + 4 * q) * 4, sum[q] + quad[q]);
@@ -621,14 +708,15 @@ static inline void store_finished(__global float *out, float16 v, PyramidSize si
 /* pyramid_blend: expands level 1 of every sub-image and lays one over the other, nearest first (eqs. 14-15); crops the
  * guard band.
  * reads   blur  level 1 of sub-images with steps
- *         flat, flat_inv, slope, fill, fill_inv  for the one in focus, which is not blurred
+ *         flat, flat_inv, slope, broad, fill, fill_inv  for the one in focus, which is not blurred
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  out  float[height - 2*guard][width - 2*guard][4]
  * range   2-D: (items per row, height - 2*guard), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_blend(__global float *restrict out, const __global float *restrict blur,
                             const __global float *restrict flat, const __global float *restrict flat_inv,
-                            const __global float *restrict slope, const __global float *restrict fill,
-                            const __global float *restrict fill_inv, const __global int4 *restrict table,
+                            const __global float *restrict slope, const __global float *restrict broad,
+                            const __global float *restrict fill, const __global float *restrict fill_inv,
+                            const __global int4 *restrict table,
                             const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
     const int y = size.guard + (int)get_global_id(1);
@@ -639,8 +727,8 @@ __kernel void pyramid_blend(__global float *restrict out, const __global float *
             const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
             float16 quad[4];
             if (sub.y == 0) {
-                if (!matted_block(quad, flat, flat_inv, slope, fill, fill_inv, sub, level, size, matting->ramp[i],
-                                  matting->seam[i], x, y)) continue;
+                if (!matted_block(quad, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size,
+                                  ramps_of(matting, i), x, y)) continue;
             } else {
                 const Between rows = between(level, y + sub.x);
                 expand_quad(quad, blur, rows, (x + sub.x) / 2);

@@ -71,7 +71,14 @@ _STEP = 1e6
 _FAR_FOCUS = 1e3
 
 SIZE = np.dtype([(name, np.int32) for name in ("width", "height", "pitch", "peels", "sources", "top", "guard")])
-_MATTING = np.dtype([("ramp", np.float32, (_COUNT, 4)), ("seam", np.float32, (_COUNT,))])
+_MATTING = np.dtype(
+    [
+        ("ramp", np.float32, (_COUNT, 4)),
+        ("before", np.float32, (_COUNT, 2)),
+        ("seam", np.float32, (_COUNT,)),
+        ("around", np.int32, (_COUNT,)),
+    ]
+)
 
 
 class SubImages(NamedTuple):
@@ -93,12 +100,18 @@ class Matting(NamedTuple):
     ----------
     ramp : ndarray, (N, 4)
         ``(up scale, up offset, down scale, down offset)`` over inverse depth, or over depth if published.
+    before : ndarray, (N, 2)
+        Back ramp of the sub-image before; zeros if published and for the first.
     seam : ndarray, (N,)
         Part of the front ramp needed per slope of 1/m per px.
+    around : ndarray, (N,)
+        Pixels at which to look for the rest of a surface: a sigma of the blur.
     """
 
     ramp: NDArray[np.float64]
+    before: NDArray[np.float64]
     seam: NDArray[np.float64]
+    around: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -176,8 +189,8 @@ class Pyramid:
             most = max(-chosen.first, chosen.last)
             before = most + chosen.first
         there = slice(before, before + len(chosen.indices))
-        params["ramp"][there] = matting.ramp
-        params["seam"][there] = matting.seam
+        for name in Matting._fields:
+            params[name][there] = getattr(matting, name)
         if both_sides:
             chosen = SubImages(-most, most)
         summary = {
@@ -293,26 +306,32 @@ def matting_functions(
     """
     count = len(chosen.indices)
     ramp, seam = np.tile((0.0, 1.0, 0.0, 1.0), (count, 1)), np.zeros(count)
+    matting = Matting(ramp, np.zeros((count, 2)), seam, np.ones(count, np.int64))
     if c1 == 0.0:
-        return Matting(ramp, seam)
+        return matting
     if paper:
         for row, i in enumerate(chosen.indices):
             ramp[row] = _paper_ramps(i, chosen.first, last, radius, c1, c0)
-        return Matting(ramp, seam)
+        return matting
     a, b = GAUSSIAN_SIGMA * c1, GAUSSIAN_SIGMA * c0  # sigma over 1/z
     for row, i in enumerate(chosen.indices):
         if i != chosen.first:
             start, end = radius(i - 2), radius(i - 1)
             ramp[row, :2] = a / (end - start), (b - start) / (end - start)
-            reach = _SEAM_REACH * max(blur_radius(abs(i)), blur_radius(abs(i - 1)))
-            seam[row] = abs(a) / (end - start) * reach
+            widest = max(blur_radius(abs(i)), blur_radius(abs(i - 1)))
+            seam[row] = abs(a) / (end - start) * _SEAM_REACH * widest
+            matting.around[row] = max(1, round(widest))
+            start, end = radius(i - 1), radius(i)
+            matting.before[row] = -a / (end - start), (end - b) / (end - start)
+            if i == 0:  # nor the plane in focus for less than whole
+                matting.before[row, 1] -= _FLOAT32_ROUNDING * (abs(matting.before[row, 1]) + abs(b / (end - start)))
         if i != last:
             start, end = radius(i), radius(i + 1)
             ramp[row, 2:] = -a / (end - start), (end - b) / (end - start)
             if i == 0:
                 # float32 may not take the plane in focus for less than whole: what is behind may be 1e6 times brighter.
                 ramp[row, 3] += _FLOAT32_ROUNDING * (abs(ramp[row, 3]) + abs(b / (end - start)))
-    return Matting(ramp, seam)
+    return matting
 
 
 def _paper_ramps(
@@ -424,17 +443,17 @@ class _Builder:
 
     def _run(self, run: str, alpha: int) -> None:
         self._set_defines(alpha)
-        flat, inv, slope, fill, fill_inv, blur = (
-            f"{run}_{name}" for name in ("flat", "flat_inv", "slope", "fill", "fill_inv", "blur")
+        flat, inv, slope, broad, fill, fill_inv, blur = (
+            f"{run}_{name}" for name in ("flat", "flat_inv", "slope", "broad", "fill", "fill_inv", "blur")
         )
         if self.method.matting == "paper":
-            slope = inv
+            slope = broad = inv
         stack = self.sources * self.frame_pixels
         steps = int(self.table[:, 0, 1].max())
         for name, nbytes in (
             (flat, stack * 16),
             (inv, stack * 4),
-            *(((slope, stack * 4),) if slope != inv else ()),
+            *(((slope, stack * 4), (broad, self.frame_pixels * 4)) if slope != inv else ()),
             (fill, self.level_pixels * 16),
             (fill_inv, self.level_pixels * 4),
             (blur, self.level_pixels * 16 if steps else 16),
@@ -442,7 +461,7 @@ class _Builder:
             self.buffers.append(Buffer(name, nbytes))
 
         tables = (read("table"), read("matting"))
-        rgbz = (read(flat), read(inv), read(slope))
+        rgbz = (read(flat), read(inv), read(slope), read(broad))
         filled = (read(fill), read(fill_inv))
         rows = self.sources * self.shape.height
         self._add(
@@ -454,9 +473,9 @@ class _Builder:
         if self.method.matting != "paper":  # else handed over, not read
             self._add(
                 "pyramid_slope",
-                (write(slope), read(inv), self.size),
+                (write(slope), write(broad), read(inv), read("matting"), self.size, np.int32(self.count)),
                 (self.items, rows),
-                traffic=8 * self.sources * self.pixels,
+                traffic=(8 * self.sources + 4) * self.pixels,
             )
         updated = (read_write(fill), read_write(fill_inv), read("table"))
         self._add(

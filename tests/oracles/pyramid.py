@@ -137,14 +137,33 @@ def blur(image: np.ndarray, steps: int) -> np.ndarray:
 
 
 class Matting(NamedTuple):
-    """What a sub-image takes of a pixel: rise(inverse, slope) times fall(inverse). Where rise is 0 it is culled."""
+    """What a sub-image takes of a pixel: rise(inverse, slope, broad) times fall(inverse). Where rise is 0 it is culled.
 
-    rise: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    `broad(inverse)`: how much of the surface of each pixel of the first source is left around it; 1 if that is no matter.
+    """
+
+    rise: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
     fall: Callable[[np.ndarray], np.ndarray]
+    broad: Callable[[np.ndarray], np.ndarray]
 
 
-def ones(inverse: np.ndarray, _: np.ndarray | None = None) -> np.ndarray:
+def ones(inverse: np.ndarray, *_: np.ndarray) -> np.ndarray:
     return np.ones_like(inverse)
+
+
+def breadth(coc: np.ndarray, radius: int, step: float) -> np.ndarray:
+    """Share of eight pixels around each that belong to its surface or hide it, from signed blurs (NaN: nothing)."""
+    height, width = coc.shape
+    y, x = np.mgrid[:height, :width]
+    near = max(1, radius * 7 // 10)
+    found = np.zeros(coc.shape)
+    for dx, dy in ((radius, 0), (0, radius), (near, near), (-near, near)):
+        a = coc[np.clip(y - dy, 0, height - 1), np.clip(x - dx, 0, width - 1)]
+        b = coc[np.clip(y + dy, 0, height - 1), np.clip(x + dx, 0, width - 1)]
+        with np.errstate(invalid="ignore"):
+            found += a <= coc + np.fmax(coc - b, 0) + step
+            found += b <= coc + np.fmax(coc - a, 0) + step
+    return found / 8
 
 
 def paper_matting(i: int, first: int, last: int, z: Callable[[int], float]) -> Matting:
@@ -156,7 +175,7 @@ def paper_matting(i: int, first: int, last: int, z: Callable[[int], float]) -> M
     def ramp(inverse: np.ndarray, start: float, end: float) -> np.ndarray:
         return np.clip((depth(inverse) - start) / (end - start), 0.0, 1.0)
 
-    def rise(inverse: np.ndarray, _: np.ndarray) -> np.ndarray:
+    def rise(inverse: np.ndarray, *_: np.ndarray) -> np.ndarray:
         if i == first:
             return np.ones_like(inverse)
         if np.isinf(z(i - 2)):
@@ -170,33 +189,48 @@ def paper_matting(i: int, first: int, last: int, z: Callable[[int], float]) -> M
             return np.ones_like(inverse)
         return 1.0 - ramp(inverse, z(i), z(i + 1))
 
-    return Matting(rise, fall)
+    return Matting(rise, fall, ones)
 
 
 def seamless_matting(
     i: int, first: int, last: int, radius: Callable[[int], float], c1: float, c0: float, sigma: Callable[[int], float]
 ) -> Matting:
-    """Linear in the CoC; nothing enters a sub-image early but where it slopes into it."""
+    """Linear in the CoC. Full weight for what is broad, a share for what is thin; early only where it slopes in."""
     scale = 0.5  # sigma of the lens per CoC radius
 
     def blur_of(inverse: np.ndarray) -> np.ndarray:
         return scale * (c1 * inverse + c0)
 
-    def rise(inverse: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    def rise(inverse: np.ndarray, slope: np.ndarray, broad: np.ndarray) -> np.ndarray:
         if i == first:
             return np.ones_like(inverse)
         start, end = radius(i - 2), radius(i - 1)
         rising = (blur_of(inverse) - start) / (end - start)
         reach = 2.0 * max(sigma(i), sigma(i - 1))
-        part = np.clip(scale * abs(c1) * slope / (end - start) * reach, 1e-3, 1.0)
-        return np.clip((rising - 1.0) / part + 1.0, 0.0, 1.0)
+        steep = scale * abs(c1) * slope / (end - start)
+        part = np.clip(np.where(steep > 1.0, 0.0, steep) * reach, 1e-3, 1.0)
+        early = np.clip((rising - 1.0) / part + 1.0, 0.0, 1.0) * np.clip(2.0 * broad - 1.0, 0.0, 1.0)
+        into = np.clip((blur_of(inverse) - end) / (radius(i) - end), 0.0, 1.0)
+        others = 1.0 - (1.0 - into) * broad
+        own = np.where(others > 1e-3, into / np.maximum(others, 1e-3), 1.0)
+        return np.where(rising < 1.0, early, own)
+
+    def broad(inverse: np.ndarray) -> np.ndarray:
+        blur = np.where(inverse < 0, np.nan, blur_of(inverse))
+        result = np.ones_like(inverse)
+        for j in range(first + 1, last + 1):
+            near, far = radius(j - 1), radius(j)
+            around = max(1, round(max(sigma(j), sigma(j - 1))))
+            own = (blur >= near) & (blur < far)
+            result = np.where(own, breadth(blur, around, far - near), result)
+        return result
 
     def fall(inverse: np.ndarray) -> np.ndarray:
         if i == last:
             return np.ones_like(inverse)
         return np.clip((radius(i + 1) - blur_of(inverse)) / (radius(i + 1) - radius(i)), 0.0, 1.0)
 
-    return Matting(rise, fall)
+    return Matting(rise, fall, broad)
 
 
 # Sigma of the Gaussian that fits `blur` best, by steps; `fitted_sigma` measures it.
@@ -239,7 +273,7 @@ def mattings(
 ) -> dict[int, Matting]:
     """Matting functions of sub-images `first` to `last`; `rule_last` is imax."""
     if c1 == 0.0:
-        return {i: Matting(ones, ones) for i in range(first, last + 1)}
+        return {i: Matting(ones, ones, ones) for i in range(first, last + 1)}
 
     def r(i: int) -> float:
         return radius(i, perceived_blur)
@@ -284,8 +318,8 @@ def cull(stack: Stack, matting: Matting) -> tuple[np.ndarray, np.ndarray, np.nda
     """Colour, inverse depth and rise of each pixel's first source that the sub-image does not cull."""
     rise = np.zeros(stack.inverse.shape[1:])
     color, inverse = np.zeros(stack.color.shape[1:]), np.full(rise.shape, EMPTY)
-    for c, w, s in zip(*stack, strict=True):
-        r = np.where(w < 0, 0.0, matting.rise(w, s))
+    for number, (c, w, s) in enumerate(zip(*stack, strict=True)):
+        r = np.where(w < 0, 0.0, matting.rise(w, s, matting.broad(w) if number == 0 else np.ones_like(w)))
         take = (rise <= 0) & (r > 0)
         rise, inverse = np.where(take, r, rise), np.where(take, w, inverse)
         color = np.where(take[..., None], c, color)
@@ -298,7 +332,7 @@ def matte(stack: Stack, matting: Matting, steps: int) -> np.ndarray:
     color, inverse, rise = embed(color, steps, 0.0), embed(inverse, steps, EMPTY), embed(rise, steps, 0.0)
     hole = inverse < 0
     color, inverse = fill(color, inverse)
-    rise = np.where(hole, matting.rise(inverse, np.zeros_like(inverse)), rise)
+    rise = np.where(hole, matting.rise(inverse, np.zeros_like(inverse), np.ones_like(inverse)), rise)
     weight = np.where(inverse < 0, 0.0, rise * matting.fall(inverse))
     return color * weight[..., None]
 
