@@ -521,7 +521,10 @@ static inline int matted_block(float16 quad[4], const __global float *flat, cons
 {
     float16 from, w;
     int only;
-    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, size, ramps, x, y) * matting_fall(w, ramps.ramp);
+    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, size, ramps, x, y);
+    /* What a visible surface with a share of its weight lets through of the next that is not culled. */
+    float16 lets = from == 0.0f ? 1.0f - weight : (float16)(0.0f);
+    weight *= matting_fall(w, ramps.ramp);
     float16 filled = (float16)(0.0f); /* weight of holes */
     float holes = 0.0f;
     const Between rows = between(level, y + sub.x);
@@ -534,12 +537,26 @@ static inline int matted_block(float16 quad[4], const __global float *flat, cons
     const float pixels = sum16(weight);
 #pragma unroll
     for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
-    if (pixels + holes <= 0.0f) return 0;
+    if (pixels + holes + sum16(lets) <= 0.0f) return 0;
     if (pixels > 0.0f) {
 #pragma unroll
         for (int q = 0; q < 4; q++)
             quad[q] = source_quad(flat, size, part(from, q), only, x + 4 * q, y) * spread(part(weight, q));
     }
+#if !PYRAMID_PAPER
+    if (sum16(lets) > 0.0f) {
+        for (int s = 1; s < size.sources; s++) {
+            const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
+            float16 ws = load_quad(flat_inv + at);
+            float16 r = lets * matting_rise(ws, slope + at, 0, ramps);
+            lets = r > 0.0f ? (float16)(0.0f) : lets;
+            r *= matting_fall(ws, ramps.ramp);
+            if (sum16(r) == 0.0f) continue;
+#pragma unroll
+            for (int q = 0; q < 4; q++) quad[q] += load_quad(flat + (at + 4 * q) * 4) * spread(part(r, q));
+        }
+    }
+#endif
     if (holes > 0.0f) {
 #pragma unroll
         for (int h = 0; h < 2; h++) {

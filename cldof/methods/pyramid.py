@@ -7,8 +7,9 @@ of it, the holes are filled from around them, pixels are weighted by depth, blur
 ``matting="paper"``, ``radius="paper"``, ``hidden="interpolated"`` and ``normalise=False`` together are the method as
 published. The defaults differ, each by measurement (docs/methods/pyramid.md):
 
-- ``matting="seamless"``: ramps are linear in the CoC, so that they reach beyond infinity and no special cases are left,
-  and a surface enters the sub-image behind its own only where it slopes into it, as far as the blur opens a seam.
+- ``matting="seamless"``: ramps are linear in the CoC, so that they reach beyond infinity and no special cases are left.
+  A surface enters the sub-image behind its own only where it is broad and slopes into it, as far as the blur opens a
+  seam, and takes full weight in its own only where it is broad (as in ``layered``).
 - ``radius="fitted"``: r(i) is that of the Gaussian that fits the filters best. It differs from eq. 13 for one step.
 - ``hidden="peels"``: behind what is culled stands the next peel, and only where there is none an interpolated pixel.
 - ``normalise=True``: the result is divided by its coverage.
@@ -230,7 +231,8 @@ class Pyramid:
 
         return Locality(
             max(2 * _MARGIN, 2**steps),
-            math.ceil(3.5 * 2**steps) + 4,
+            # Light spreads that far, and by how much goes by what is a sigma around.
+            math.ceil(3.5 * 2**steps + (blur_radius(steps) if self.matting == "seamless" else 0.0)) + 4,
             reach_px,
             leak,
             # The farthest sub-image culls most.

@@ -314,11 +314,11 @@ def embed(array: np.ndarray, steps: int, value: float) -> np.ndarray:
     return result
 
 
-def cull(stack: Stack, matting: Matting) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Colour, inverse depth and rise of each pixel's first source that the sub-image does not cull."""
+def cull(stack: Stack, matting: Matting, first: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Colour, inverse depth and rise of each pixel's first source, from `first` on, that the sub-image does not cull."""
     rise = np.zeros(stack.inverse.shape[1:])
     color, inverse = np.zeros(stack.color.shape[1:]), np.full(rise.shape, EMPTY)
-    for number, (c, w, s) in enumerate(zip(*stack, strict=True)):
+    for number, (c, w, s) in enumerate(zip(*stack, strict=True), first):
         r = np.where(w < 0, 0.0, matting.rise(w, s, matting.broad(w) if number == 0 else np.ones_like(w)))
         take = (rise <= 0) & (r > 0)
         rise, inverse = np.where(take, r, rise), np.where(take, w, inverse)
@@ -329,12 +329,22 @@ def cull(stack: Stack, matting: Matting) -> tuple[np.ndarray, np.ndarray, np.nda
 def matte(stack: Stack, matting: Matting, steps: int) -> np.ndarray:
     """A sub-image before the blur: culled, disoccluded and weighted, at its own size."""
     color, inverse, rise = cull(stack, matting)
+    behind = embed(seen_behind(stack, matting), steps, 0.0)
     color, inverse, rise = embed(color, steps, 0.0), embed(inverse, steps, EMPTY), embed(rise, steps, 0.0)
     hole = inverse < 0
     color, inverse = fill(color, inverse)
     rise = np.where(hole, matting.rise(inverse, np.zeros_like(inverse), np.ones_like(inverse)), rise)
     weight = np.where(inverse < 0, 0.0, rise * matting.fall(inverse))
-    return color * weight[..., None]
+    return color * weight[..., None] + behind
+
+
+def seen_behind(stack: Stack, matting: Matting) -> np.ndarray:
+    """What the first source lets through, where it has only a share of its weight, of the next that is not culled."""
+    first, slope = stack.inverse[0], stack.slope[0]
+    rise = np.where(first < 0, 0.0, matting.rise(first, slope, matting.broad(first)))
+    lets = np.where(rise > 0, 1.0 - rise, 0.0) * (matting.broad is not ones)
+    color, inverse, behind = cull(Stack(*(part[1:] for part in stack)), matting, first=1)
+    return color * (lets * behind * np.where(inverse < 0, 0.0, matting.fall(inverse)))[..., None]
 
 
 def sub_image(stack: Stack, matting: Matting, steps: int) -> np.ndarray:
