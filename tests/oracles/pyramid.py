@@ -137,7 +137,7 @@ def blur(image: np.ndarray, steps: int) -> np.ndarray:
 
 
 class Matting(NamedTuple):
-    """What a sub-image takes of a pixel: rise(inverse, slope, broad) times fall(inverse). Where rise is 0 it is culled.
+    """What a sub-image takes of a pixel: rise(inverse, slope, broad) times fall(inverse). Rise 0: culled.
 
     `broad(inverse)`: how much of the surface of each pixel of the first source is left around it; 1 if that is no matter.
     """
@@ -315,7 +315,7 @@ def embed(array: np.ndarray, steps: int, value: float) -> np.ndarray:
 
 
 def cull(stack: Stack, matting: Matting, first: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Colour, inverse depth and rise of each pixel's first source, from `first` on, that the sub-image does not cull."""
+    """Colour, inverse depth and rise of each pixel's first source, from `first` on, that is not culled."""
     rise = np.zeros(stack.inverse.shape[1:])
     color, inverse = np.zeros(stack.color.shape[1:]), np.full(rise.shape, EMPTY)
     for number, (c, w, s) in enumerate(zip(*stack, strict=True), first):
