@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import erf
 
 from cldof import Camera, FrameError, InputError, LayeredFrame, Lens, Renderer, SceneError
 from cldof.capture.scene import Node, Scene
@@ -316,3 +317,44 @@ def test_a_sweep_of_focus_does_not_jump(method: str, device_info: DeviceInfo) ->
     assert steps.max() <= 1.5 * theory.max()
     # The sweep crosses the plane: a method that showed no blur at all would not jump either.
     assert rms.max() >= 0.5 * largest.max()
+
+
+def picket_sweep(camera: Camera, lenses: list[Lens], depth_m: float, edges: list[tuple[int, int]]) -> np.ndarray:
+    """Share of each column that white pickets cover through a Gaussian lens, (frames, width)."""
+    x = np.arange(camera.width) + 0.5
+    sigma = 0.5 * np.abs([float(lens.coc_radius_px(camera, depth_m)) for lens in lenses])[:, None]
+    cover = np.zeros((len(lenses), camera.width))
+    for start, end in edges:
+        cover += 0.5 * (erf((x - start) / (math.sqrt(2.0) * sigma)) - erf((x - end) / (math.sqrt(2.0) * sigma)))
+    return cover
+
+
+# The pyramid's blurs are a factor of 2 apart, so a surface changes more where it passes from one to the next.
+PICKETS = {"layered": 1.5, "pyramid": 2.6}
+
+
+@pytest.mark.parametrize("method", sorted(PICKETS))
+@pytest.mark.parametrize("tilt", [0.0, 0.004], ids=["facing", "tilted"])
+def test_pickets_do_not_jump_from_layer_to_layer(method: str, tilt: float, device_info: DeviceInfo) -> None:
+    """White pickets before a dark wall, focus from near them to the wall: as they pass from one depth layer to the next
+    they must neither show twice nor vanish for a frame. A grey wall's blur does not show, so theory is exact."""
+    width, height, depth = 96, 48, 1.0
+    edges = [(12, 19), (30, 34), (45, 48), (60, 72)]
+    camera = Camera(width, height, 40.0)
+    color = np.empty((2, height, width, 4), np.float32)
+    color[:] = (0.2, 0.2, 0.2, 1.0)
+    depths = np.full((2, height, width), 4.0, np.float32)
+    for start, end in edges:
+        color[0, :, start:end] = 1.0
+        # Not all of a picket passes at once.
+        depths[0, :, start:end] = depth * (1.0 + tilt * np.arange(height)[:, None] / height)
+    frame = LayeredFrame(color, depths, camera)
+    lenses = LensTrack.rack(Lens(0.12, 1.1, aperture="gaussian"), 4.0, 120).lenses(120)
+    with Renderer(method, device=device_info.index) as renderer:
+        rendered = np.stack([result.image[..., 0] for result in render_track(renderer, frame, lenses)])
+    expected = 0.2 + 0.8 * picket_sweep(camera, lenses, depth, edges)
+    steps = np.diff(rendered[:, 12:-12, 8:-8].astype(np.float64), axis=0)
+    theory = np.diff(expected[:, 8:-8], axis=0)
+    rms, largest = np.sqrt((steps**2).mean(axis=(1, 2))), np.sqrt((theory**2).mean(axis=1))
+    assert rms.max() <= PICKETS[method] * largest.max()
+    assert rms.sum() >= 0.7 * largest.sum()

@@ -200,7 +200,7 @@ class Layered:
         # Neighbouring layers blur by different amounts: their seam and a surface's breadth go by the greater.
         sigma[1:] = np.maximum(sigma[1:], sigma[:-1])
         params["reach"][there] = _SEAM_REACH * sigma
-        params["around"][there] = np.maximum(1, np.rint(sigma))
+        params["around"][there] = np.maximum(1, np.ceil(sigma))
         if both_sides:
             stack = LayerStack(before + stack.front, stack.back + after, stack.sigma_step)
         summary = {

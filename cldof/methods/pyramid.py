@@ -322,7 +322,7 @@ def matting_functions(
             ramp[row, :2] = a / (end - start), (b - start) / (end - start)
             widest = max(blur_radius(abs(i)), blur_radius(abs(i - 1)))
             seam[row] = abs(a) / (end - start) * _SEAM_REACH * widest
-            matting.around[row] = max(1, round(widest))
+            matting.around[row] = max(1, math.ceil(widest))
             start, end = radius(i - 1), radius(i)
             matting.before[row] = -a / (end - start), (end - b) / (end - start)
             if i == 0:  # nor the plane in focus for less than whole

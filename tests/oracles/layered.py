@@ -1,5 +1,6 @@
 """The layered method in float64, from Schedl & Wimmer 2012 and the choices in docs/decisions.md."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -103,7 +104,7 @@ def weights(coc: np.ndarray, alpha: np.ndarray, layers: np.ndarray, paper: bool)
                 part = np.clip(slope(c, rise_width) / rise_width * 2.0 * widest, 1e-3, 1.0)
                 early = np.clip(1.0 + (rising - 1.0) / part, 0, 1)
                 if k > 0 and m == 0:
-                    broad = breadth(c, max(1, round(widest)), z[k] - z[k - 1])
+                    broad = breadth(c, max(1, math.ceil(widest)), z[k] - z[k - 1])
                     early = early * np.clip(2.0 * broad - 1.0, 0, 1)
                 rise = np.where(rising >= 1, 1.0, early)
                 may_fall = np.full(c.shape, k == count - 1) | (before <= z[k])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -139,7 +140,7 @@ def blur(image: np.ndarray, steps: int) -> np.ndarray:
 class Matting(NamedTuple):
     """What a sub-image takes of a pixel: rise(inverse, slope, broad) times fall(inverse). Rise 0: culled.
 
-    `broad(inverse)`: how much of the surface of each pixel of the first source is left around it; 1 if that is no matter.
+    `broad(inverse)`: how much of the surface of each pixel of the first source is left around it; else 1.
     """
 
     rise: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -220,7 +221,7 @@ def seamless_matting(
         result = np.ones_like(inverse)
         for j in range(first + 1, last + 1):
             near, far = radius(j - 1), radius(j)
-            around = max(1, round(max(sigma(j), sigma(j - 1))))
+            around = max(1, math.ceil(max(sigma(j), sigma(j - 1))))
             own = (blur >= near) & (blur < far)
             result = np.where(own, breadth(blur, around, far - near), result)
         return result
