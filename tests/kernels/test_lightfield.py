@@ -156,7 +156,24 @@ def test_depth_keys_keep_the_order_of_floats() -> None:
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("glass", [False, True])
 def test_slots_are_those_of_the_twin(device: Device, size: tuple[int, int], glass: bool) -> None:
-    color, inv_depth = layers(*size, seed=size[1])
+    check_slots(device, *layers(*size, seed=size[1]), glass)
+
+
+def test_slopes_too_steep_for_a_byte_are_edges(device: Device) -> None:
+    """Straight slopes of 6 to 9 px of CoC a pixel, each in a row of its own: beyond 7.5 px they end at every pixel."""
+    slopes = np.linspace(6.0, 9.0, 31, dtype=np.float32)[:, None]
+    row = 0.1 + slopes / abs(C1) * np.arange(24, dtype=np.float32)
+    inv_depth = np.stack([row, np.full_like(row, 0.0), np.full_like(row, -1.0)]).astype(np.float32)
+    color = np.ones((*inv_depth.shape, 4), np.float32)
+    color[2] = 0.0
+    inner = oracle.edges(inv_depth, oracle.coc(inv_depth, C1, C0))[0, :, 2:-2, 1]
+    is_end = np.abs((inner & 255) - 128) <= 7  # as the kernels read the byte
+    assert not is_end[:15].any() and is_end[17:].all()
+    check_slots(device, color, inv_depth, False)
+
+
+def check_slots(device: Device, color: np.ndarray, inv_depth: np.ndarray, glass: bool) -> None:
+    size = inv_depth.shape[2], inv_depth.shape[1]
     shape = FrameShape(3, size[1], size[0], 0, True, glass)
     some = oracle.slots(inv_depth, color[..., 3], shape.pitch, C1, C0, 3 if glass else 1, "surface")
     expected = packed_slots(some, shape)
