@@ -181,6 +181,7 @@ MUTANTS: list[Mutant] = [
         ("off by one", "const int x0 = cx * MULTIVIEW_SCALE - reach,", "const int x0 = cx * MULTIVIEW_SCALE + reach,"),
         ("swap", "float4 weight = v.s37bf >= MULTIVIEW_OPAQUE ? ins[q] : owns[q];", "float4 weight = ins[q];"),
         ("sign", "middle + share * (total / weight - middle) : middle;", "middle : middle;"),
+        ("swap", "(float2)(places->bound[s], places->bound[s + 1]) * c1 + c0;", "(float2)(places->bound[s + 1], places->bound[s]) * c1 + c0;"),
         ("compare", "if (known <= least) return pinhole", "if (known < 0.0f) return pinhole"),
         ("drop", "quad[q] += v * spread((1.0f - covered) * weight);", "quad[q] += v * spread(weight);"),
         ("weight", "const float weight = t < 0 || t == taps ? edge : 1.0f;", "const float weight = 1.0f;"),
