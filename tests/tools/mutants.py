@@ -157,7 +157,7 @@ MUTANTS: list[Mutant] = [
         ("compare", "& (alpha >= 0.5f)) ? w : depth;", "& (alpha > 0.5f)) ? w : depth;"),
         ("sign", "image += (1.0f - image.s33337777bbbbffff) * c;", "image += c;"),
         ("drop", "to_b = b < 0.0f ? (float16)(MAXFLOAT) : to_b;", ""),
-        ("clamp", "needed = needed > 1.0f ? (float16)(1.0f) : needed;", ""),
+        ("clamp", "needed = needed > 1.0f ? one : needed;", ""),
         ("swap", "return clamp01(matting_axis(w) * ramp.z + ramp.w);", "return clamp01(matting_axis(w) * ramp.x + ramp.y);"),
         ("compare", "int16 take = (rise <= 0.0f) & (r > 0.0f);", "int16 take = (rise <= 0.0f) & (r >= 0.0f);"),
         ("weight", "float4 scale = count > 0.0f ? 1.0f / count : (float4)(0.0f);", "float4 scale = count > 0.0f ? (float4)(0.25f) : (float4)(0.0f);"),
