@@ -105,15 +105,17 @@ static inline float2 ends_of(const __global MultiviewPlaces *places, int s, int 
 }
 
 /* How far a surface goes on behind a slot on its way to the next pixel, in 1/m: the lesser step of both sides, so that a
- * silhouette does not count, and nothing where neither side is connected. `c1` px of C is one 1/m. */
+ * silhouette does not count, and nothing where neither side is connected or the slot sticks out from both: a lone pixel
+ * just before a surface is no slope. `c1` px of C is one 1/m. */
 static inline float16 step_of(float16 w, float16 a, float16 b, float c1)
 {
-    float16 to_a = w > a ? w - a : a - w, to_b = w > b ? w - b : b - w;
-    to_a = a < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : to_a;
-    to_b = b < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : to_b;
-    to_a = to_a < to_b ? to_a : to_b;
-    float16 px = to_a * (c1 < 0.0f ? -c1 : c1);
-    return px > MULTIVIEW_CONNECTED || to_a == MULTIVIEW_NOWHERE ? (float16)(0.0f) : to_a;
+    const float16 to_a = w > a ? w - a : a - w, to_b = w > b ? w - b : b - w;
+    const float16 px_a = a < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : to_a * (c1 < 0.0f ? -c1 : c1);
+    const float16 px_b = b < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : to_b * (c1 < 0.0f ? -c1 : c1);
+    const float16 least = px_a < px_b ? to_a : to_b;
+    const int16 a_joins = px_a <= MULTIVIEW_CONNECTED, b_joins = px_b <= MULTIVIEW_CONNECTED;
+    const int16 sticks_out = a_joins & b_joins & ((w - a) * (w - b) > 0.0f);
+    return (a_joins | b_joins) & ~sticks_out ? least : (float16)(0.0f);
 }
 
 /* multiview_place: keeps what depends on the lens where all passes of the frame find it.

@@ -151,14 +151,20 @@ class Layering(NamedTuple):
 
     @classmethod
     def anchored(cls, nearest: float, farthest: float, c1: float, c0: float, delta_px: float, most: int) -> Layering:
-        """Even layers that stand still in the scene: their number depends on the aperture, not on the focus."""
+        """Even layers that stand still in the scene: their number depends on the aperture, not on the focus.
+
+        The ends of the range lie in the middle of layers: what is nearest or farthest is a facing surface more often
+        than what lies between.
+        """
         wanted = math.ceil(min((nearest - farthest) * abs(c1) / delta_px - 1e-6, float(most)))
+        wanted = min(wanted + (wanted > 1), most)
         # 1, 2, 3, 4, 6, 8, 12, ...: an aperture in motion keeps to few of them.
         octave = 1 << max(0, wanted - 1).bit_length()
         count = max(1, min(octave * 3 // 4 if octave >= 4 and wanted <= octave * 3 // 4 else octave, most))
-        inverse = np.linspace(nearest, farthest, count + 1).astype(np.float32)
-        step = max((nearest - farthest) / count, 1e-9)  # kernels divide by it
-        return cls(inverse, c1, c0, nearest, step, step, 0.0, 0.0)
+        step = max((nearest - farthest) / max(count - 1, 1), 1e-9)  # kernels divide by it
+        anchor = nearest + step / 2.0
+        inverse = (anchor - step * np.arange(count + 1)).astype(np.float32)
+        return cls(inverse, c1, c0, anchor, step, step, 0.0, 0.0)
 
     @classmethod
     def around_focus(
@@ -442,15 +448,15 @@ class Multiview:
             places[name][: len(values)] = values
         plain = _plain([w is None for w in windows])
         structure = LensLayers(where.total, lens.aperture, plain, eyes, halvings, where.refined)
-        limits = where.limits
+        farthest, nearest = _inverse_depths(frame)
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},
             "layers": where.total,
-            "focus_layer": int(np.clip(np.searchsorted(limits, 0.0) - 1, 0, where.total - 1)),
+            "focus_layer": int(np.clip(np.searchsorted(where.limits, 0.0) - 1, 0, where.total - 1)),
             "delta_px": where.delta_px,
-            "largest_near_coc_px": max(0.0, -float(limits[0])),
-            "largest_far_coc_px": max(0.0, float(limits[-1])),
+            "largest_near_coc_px": max(0.0, -(where.c1 * nearest + where.c0)),
+            "largest_far_coc_px": max(0.0, where.c1 * farthest + where.c0),
             "eyes": eyes,
             "refine_steps": halvings,
             "highlight_rays": min(_BRIGHT_RAYS * self.rays, MAX_RAYS),
@@ -471,9 +477,7 @@ class Multiview:
     def layering(self, frame: LayeredFrame, lens: Lens) -> Layering:
         """Where the layers of a frame are through a lens."""
         c1, c0 = (value / self.supersample for value in lens.coc_coefficients(frame.camera))
-        farthest, nearest = frame.inverse_depth_range
-        if not frame.is_opaque:
-            farthest = 0.0  # the void is a surface at infinity
+        farthest, nearest = _inverse_depths(frame)
         shape = FrameShape.of(frame)
         most = self.layers
         if self.traversal == "layers":
@@ -595,6 +599,12 @@ def _matched_scale(coc: float, aperture: Aperture, antialias: bool) -> float:
     wanted = coc**2 * points.var(axis=0).mean() + (0.0 if antialias else -1.0 / 12.0)
     found = np.floor(coc * tries[:, None, None] * points + 0.5).var(axis=1).mean(axis=1)
     return float(tries[np.abs(found - wanted).argmin()])
+
+
+def _inverse_depths(frame: LayeredFrame) -> tuple[float, float]:
+    """Least and greatest inverse depth of what a frame shows, 1/m; the void is a surface at infinity."""
+    farthest, nearest = frame.inverse_depth_range
+    return farthest if frame.is_opaque else 0.0, nearest
 
 
 @lru_cache(32)

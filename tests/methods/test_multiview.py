@@ -554,10 +554,11 @@ def test_layers_reach_the_coc_range() -> None:
     plan = Multiview().plan(frame, lens)
     layers = Multiview().layering(frame, lens)
     assert 0.25 < layers.delta_px <= 0.5
-    assert layers.limits[0] == pytest.approx(-plan.summary["largest_near_coc_px"])
-    assert layers.limits[-1] == pytest.approx(plan.summary["largest_far_coc_px"])
+    # What is nearest and what is farthest stand in the middle of their layers.
+    assert layers.coc[0] == pytest.approx(-plan.summary["largest_near_coc_px"], abs=1e-5)
+    assert layers.coc[-1] == pytest.approx(plan.summary["largest_far_coc_px"], abs=1e-5)
     seen = lens.coc_radius_px(frame.camera, frame.depth[np.isfinite(frame.depth)])
-    assert layers.limits[0] == pytest.approx(seen.min(), abs=1e-4) and layers.limits[-1] >= seen.max()
+    assert layers.coc[0] == pytest.approx(seen.min(), abs=1e-4) and layers.limits[-1] >= seen.max()
     huge = Lens(5000.0 / frame.camera.focal_px, 1.7)
     assert Multiview().plan(frame, huge).structure.total <= MAX_LAYERS
     assert Multiview(layers=6).plan(frame, huge).structure.total <= 6

@@ -16,7 +16,7 @@ class Slots(NamedTuple):
 
 
 def slots(inverse_depth: np.ndarray, c1: float, c0: float, scale: int = 1) -> Slots:
-    """Near end of each slot, and how far its surface goes on behind it: to the next pixel or beyond.
+    """Near end of each slot, and how far its surface goes on behind it: to the next pixel or beyond, if it slopes.
 
     ``inverse_depth`` is negative where nothing is.
     """
@@ -26,13 +26,14 @@ def slots(inverse_depth: np.ndarray, c1: float, c0: float, scale: int = 1) -> Sl
     for axis in (1, 2):
         steps = []
         for shift in (1, -1):
-            step = np.abs(np.roll(near, shift, axis) - near)
+            step = np.roll(near, shift, axis) - near
             edge = [slice(None)] * 3
             edge[axis] = slice(0, 1) if shift == 1 else slice(-1, None)
             step[tuple(edge)] = np.inf
             steps.append(step)
-        least = np.minimum(*steps)
-        far += (1 if scale == 1 else scale + 1) * np.where(least > 2.0, 0.0, least)
+        least, most = np.minimum(*np.abs(steps)), np.maximum(*np.abs(steps))
+        sticks_out = (most <= 2.0) & (np.sign(steps[0]) * np.sign(steps[1]) > 0)
+        far += (1 if scale == 1 else scale + 1) * np.where((least > 2.0) | sticks_out, 0.0, least)
     return Slots(np.where(there, near, np.inf), np.where(there, far, -np.inf))
 
 
