@@ -578,6 +578,10 @@ class Renderer:
                 program = _resolved(program, self._image_size(shape), self._supersample)
             ring = FrameRing(program, self.device, self._slots)
             self._rings[key] = ring
+            # What frames of other kinds left behind is of use again only if their sizes come back.
+            pool = self.device.pool
+            if pool.allocated_bytes > 2 * pool.in_use_bytes:
+                pool.trim()
         self._rings.move_to_end(key)
         return ring, is_new
 

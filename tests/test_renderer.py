@@ -59,6 +59,15 @@ def test_a_steady_frame_allocates_nothing(device_info: DeviceInfo) -> None:
         assert renderer.device.pool.allocated_bytes == held
 
 
+def test_sizes_that_do_not_come_back_are_given_back(device_info: DeviceInfo) -> None:
+    """A renderer keeps no more memory for reuse than it uses, however many kinds of frame it has seen."""
+    with Renderer("layered", device=device_info.index) as renderer:
+        pool = renderer.device.pool
+        for side in range(400, 40, -40):
+            renderer.render(noise_frame(side, side), Lens(0.05, 2.0))
+            assert pool.allocated_bytes <= 2 * pool.in_use_bytes
+
+
 def test_out_is_filled_and_returned(device_info: DeviceInfo) -> None:
     frame = noise_frame(20, 10)
     out = np.full((10, 20, 4), np.nan, np.float32)
