@@ -733,7 +733,9 @@ class _Planner:
                 "thick rays (cones)", room > 1.0, reason + ("" if room > 1.0 else ", no more than pixels do")
             )
         if "rays" in says:
-            fewer = ", fewer where all that a cell of 16 x 16 px can see is little blurred" if says["adaptive"] else ""
+            fewer = (
+                ", fewer where all that a cell of 16 x 16 px can see is in focus or nearly" if says["adaptive"] else ""
+            )
             yield Decision("rays", True, f"up to {says['rays']} a pixel{fewer}")
         if says.get("highlights"):
             # Layers may be blurred more than what they hold.
