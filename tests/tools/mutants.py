@@ -176,7 +176,8 @@ MUTANTS: list[Mutant] = [
     *_rows(
         "multiview.cl",
         ("sign", "float16 c = steps.anchor - w,", "float16 c = steps.anchor + w,"),
-        ("compare", "to_a = to_a < to_b ? to_a : to_b;\n    float16 px", "to_a = to_a > to_b ? to_a : to_b;\n    float16 px"),
+        ("compare", "least = px_a < px_b ? to_a : to_b;", "least = px_a > px_b ? to_a : to_b;"),
+        ("drop", "return (a_joins | b_joins) & ~sticks_out ? least", "return (a_joins | b_joins) ? least"),
         ("off by one", "step = 1 << (level - 1);", "step = 1 << level;"),
         ("off by one", "const int x0 = cx * MULTIVIEW_SCALE - reach,", "const int x0 = cx * MULTIVIEW_SCALE + reach,"),
         ("swap", "float4 weight = v.s37bf >= MULTIVIEW_OPAQUE ? ins[q] : owns[q];", "float4 weight = ins[q];"),
