@@ -13,6 +13,7 @@
 
 #include "common.clh"
 #include "fir.clh"
+#include "slots.clh"
 
 #define LAYERED_MAX_LAYERS 32
 #define LAYERED_TILE 64
@@ -78,67 +79,11 @@ static inline LayeredLayer layered_layer(const __global LayeredMatting *matting,
     return layer;
 }
 
-static inline float16 layered_least_step(float16 w, float16 a, float16 b, float silhouette)
-{
-    float16 to_a = w > a ? w - a : a - w, to_b = w > b ? w - b : b - w;
-    to_a = a < 0.0f || to_a > silhouette ? (float16)(MAXFLOAT) : to_a;
-    to_b = b < 0.0f || to_b > silhouette ? (float16)(MAXFLOAT) : to_b;
-    to_a = to_a < to_b ? to_a : to_b;
-    return to_a < MAXFLOAT ? to_a : (float16)(0.0f);
-}
-
-/* Change of inverse depth from one pixel to the next, for 16 slots: the lesser of both sides and the greater of both
- * directions. Steps above `silhouette` are where one surface ends and do not count. */
-static inline float16 layered_slope(const __global float *inv, float16 w, LayeredSize size, int x, int y,
-                                    float silhouette)
-{
-    const float16 none = (float16)(EMPTY);
-    float16 left = x > 0 ? load_quad(inv - 1) : (float16)(EMPTY, w.s01234567, w.s89ab, w.scd, w.se);
-    float16 right = x + 16 < size.pitch ? load_quad(inv + 1) : (float16)(w.s12345678, w.s9abc, w.sde, w.sf, EMPTY);
-    float16 above = y > 0 ? load_quad(inv - size.pitch) : none;
-    float16 below = y + 1 < size.height ? load_quad(inv + size.pitch) : none;
-    float16 across = layered_least_step(w, left, right, silhouette);
-    float16 down = layered_least_step(w, above, below, silhouette);
-    return across > down ? across : down;
-}
-
-/* Slots x .. x+15 of a row; beyond its ends the row repeats its last slot. */
-static inline float16 layered_row(const __global float *row, int x, int width)
-{
-    if (x >= 0 && x + 16 <= width) return load_quad(row + x);
-    float v[16];
-    for (int i = 0; i < 16; i++) v[i] = row[clamp_index(x + i, width - 1)];
-    return (float16)(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14],
-                     v[15]);
-}
-
-/* How many of two opposite slots belong to the surface of the slot w between them, or hide it: those that are not
- * farther by more than `step`, or lie on a plane through the three. */
-static inline float16 layered_pair(float16 w, float16 a, float16 b, float step)
-{
-    const float16 zero = (float16)(0.0f), one = (float16)(1.0f);
-    float16 a_nearer = a > w ? a - w : zero, b_nearer = b > w ? b - w : zero;
-    return (a >= 0.0f && a >= w - b_nearer - step ? one : zero) + (b >= 0.0f && b >= w - a_nearer - step ? one : zero);
-}
-
-/* Share of the surroundings, one sigma of the blur away, that belong to the surface of each of 16 slots of the first
- * peel: about what is left of its coverage there when it is blurred. */
+/* How broad the surfaces of 16 slots of the first peel are, for the blur of a layer. */
 static inline float16 layered_breadth(const __global float *inv_depth, float16 w, LayeredSize size, LayeredLayer layer,
                                       int x, int y)
 {
-    const int far = layer.around, near = far * 7 / 10 > 1 ? far * 7 / 10 : 1;
-    const float step = 1.0f / layer.before.z;
-    const int last = size.height - 1;
-    const __global float *here = inv_depth + (size_t)y * size.pitch;
-    const __global float *up = inv_depth + (size_t)clamp_index(y - near, last) * size.pitch;
-    const __global float *down = inv_depth + (size_t)clamp_index(y + near, last) * size.pitch;
-    const __global float *top = inv_depth + (size_t)clamp_index(y - far, last) * size.pitch;
-    const __global float *bottom = inv_depth + (size_t)clamp_index(y + far, last) * size.pitch;
-    float16 found = layered_pair(w, layered_row(here, x - far, size.width), layered_row(here, x + far, size.width), step);
-    found += layered_pair(w, load_quad(top + x), load_quad(bottom + x), step);
-    found += layered_pair(w, layered_row(up, x - near, size.width), layered_row(down, x + near, size.width), step);
-    found += layered_pair(w, layered_row(up, x + near, size.width), layered_row(down, x - near, size.width), step);
-    return found * 0.125f;
+    return breadth_of(inv_depth, w, x, y, size.width, size.height, size.pitch, layer.around, 1.0f / layer.before.z);
 }
 
 /* Weights of 16 slots in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), with three changes.
@@ -171,7 +116,8 @@ static inline float16 layered_weight(const __global float *inv_depth, const __gl
     if (peel > 0) down = before * layer.own.z + layer.own.w >= 1.0f ? down : at_once;
     float16 between = rising > 0.0f && rising < 1.0f ? one : zero;
     if (sum16(between) > 0.0f) {
-        float16 part = layered_slope(inv, w, size, x, y, -1.0f / layer.own.x) * (-layer.own.x * layer.reach);
+        float16 part = slope_of(inv, w, x, y, size.height, size.pitch, -1.0f / layer.own.x);
+        part *= -layer.own.x * layer.reach;
         part = part > 1.0f ? one : part;
         part = part < 1e-3f ? (float16)(1e-3f) : part;
         up = clamp01((rising - 1.0f) / part + 1.0f);

@@ -18,7 +18,7 @@
  * block of its row. Rows are numbered so that the same one shows the same part of the frame in all sub-images, which
  * follow each other closely and find it in the cache. */
 
-#include "common.clh"
+#include "slots.clh"
 
 #define PYRAMID_LEVELS 16
 /* The most sub-images. */
@@ -155,50 +155,6 @@ __kernel void pyramid_flatten(__global float *restrict flat, __global float *res
     }
 }
 
-static inline float16 least_step(float16 w, float16 a, float16 b)
-{
-    float16 to_a = w > a ? w - a : a - w, to_b = w > b ? w - b : b - w;
-    to_a = a < 0.0f ? (float16)(MAXFLOAT) : to_a;
-    to_b = b < 0.0f ? (float16)(MAXFLOAT) : to_b;
-    to_a = to_a < to_b ? to_a : to_b;
-    return to_a < MAXFLOAT ? to_a : (float16)(0.0f);
-}
-
-/* Slots x .. x+15 of a row; beyond its ends the row repeats its last slot. */
-static inline float16 row_of_slots(const __global float *row, int x, int width)
-{
-    if (x >= 0 && x + 16 <= width) return load_quad(row + x);
-    float v[16];
-    for (int i = 0; i < 16; i++) v[i] = row[clamp_index(x + i, width - 1)];
-    return (float16)(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14],
-                     v[15]);
-}
-
-/* How many of two opposite slots belong to the surface of the slot w between them, or hide it: those that are not
- * farther by more than `step`, or lie on a plane through the three. */
-static inline float16 count_pair(float16 w, float16 a, float16 b, float step)
-{
-    const float16 zero = (float16)(0.0f), one = (float16)(1.0f);
-    float16 a_nearer = a > w ? a - w : zero, b_nearer = b > w ? b - w : zero;
-    return (a >= 0.0f && a >= w - b_nearer - step ? one : zero) + (b >= 0.0f && b >= w - a_nearer - step ? one : zero);
-}
-
-/* Share of the surroundings that belong to the surface of each of 16 slots; as in layered.cl. */
-static inline float16 breadth(const __global float *inv, float16 w, PyramidSize size, int far, float step, int x, int y)
-{
-    const int near = far * 7 / 10 > 1 ? far * 7 / 10 : 1, last = size.height - 1;
-    const __global float *here = inv + (size_t)y * size.pitch;
-    const __global float *up = inv + (size_t)clamp_index(y - near, last) * size.pitch;
-    const __global float *down = inv + (size_t)clamp_index(y + near, last) * size.pitch;
-    const __global float *top = inv + (size_t)clamp_index(y - far, last) * size.pitch;
-    const __global float *bottom = inv + (size_t)clamp_index(y + far, last) * size.pitch;
-    float16 found = count_pair(w, row_of_slots(here, x - far, size.width), row_of_slots(here, x + far, size.width), step);
-    found += count_pair(w, load_quad(top + x), load_quad(bottom + x), step);
-    found += count_pair(w, row_of_slots(up, x - near, size.width), row_of_slots(down, x + near, size.width), step);
-    found += count_pair(w, row_of_slots(up, x + near, size.width), row_of_slots(down, x - near, size.width), step);
-    return found * 0.125f;
-}
-
 /* pyramid_slope: change of inverse depth from one pixel to the next, the lesser of both sides, so that a silhouette
  * does not count as a slope, and the greater of both directions; and how much of a visible surface is left around it
  * when it is blurred.
@@ -215,14 +171,8 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
     const int row = get_global_id(1), y = row % size.height;
     for (int x = 16 * get_global_id(0); x < size.pitch; x += 16 * get_global_size(0)) {
         const __global float *inv = flat_inv + (size_t)row * size.pitch + x;
-        const float16 none = (float16)(EMPTY);
-        float16 w = load_quad(inv);
-        float16 left = x > 0 ? load_quad(inv - 1) : (float16)(EMPTY, w.s01234567, w.s89ab, w.scd, w.se);
-        float16 right = x + 16 < size.pitch ? load_quad(inv + 1) : (float16)(w.s12345678, w.s9abc, w.sde, w.sf, EMPTY);
-        float16 above = y > 0 ? load_quad(inv - size.pitch) : none;
-        float16 below = y + 1 < size.height ? load_quad(inv + size.pitch) : none;
-        float16 across = least_step(w, left, right), down = least_step(w, above, below);
-        store_quad(slope + (size_t)row * size.pitch + x, across > down ? across : down);
+        const float16 w = load_quad(inv);
+        store_quad(slope + (size_t)row * size.pitch + x, slope_of(inv, w, x, y, size.height, size.pitch, MAXFLOAT));
         if (row >= size.height) continue;
         float16 share = (float16)(1.0f);
         for (int i = 0; i < count; i++) {
@@ -231,7 +181,8 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
             float16 rest = w * before.x + before.y;
             int16 is_own = (rest > 0.0f) & (rest <= 1.0f) & (w >= 0.0f);
             if (sum16(is_own ? (float16)(1.0f) : (float16)(0.0f)) == 0.0f) continue;
-            share = is_own ? breadth(flat_inv, w, size, matting->around[i], 1.0f / before.x, x, y) : share;
+            share = is_own ? breadth_of(flat_inv, w, x, y, size.width, size.height, size.pitch, matting->around[i],
+                                        1.0f / before.x) : share;
         }
         store_quad(broad + (size_t)row * size.pitch + x, share);
     }

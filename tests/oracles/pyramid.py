@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from tests.oracles.layered import breadth
+
 # Inverse depth where there is nothing, or a hole.
 EMPTY = -1.0
 
@@ -150,21 +152,6 @@ class Matting(NamedTuple):
 
 def ones(inverse: np.ndarray, *_: np.ndarray) -> np.ndarray:
     return np.ones_like(inverse)
-
-
-def breadth(coc: np.ndarray, radius: int, step: float) -> np.ndarray:
-    """Share of eight pixels around each that belong to its surface or hide it, from signed blurs (NaN: nothing)."""
-    height, width = coc.shape
-    y, x = np.mgrid[:height, :width]
-    near = max(1, radius * 7 // 10)
-    found = np.zeros(coc.shape)
-    for dx, dy in ((radius, 0), (0, radius), (near, near), (-near, near)):
-        a = coc[np.clip(y - dy, 0, height - 1), np.clip(x - dx, 0, width - 1)]
-        b = coc[np.clip(y + dy, 0, height - 1), np.clip(x + dx, 0, width - 1)]
-        with np.errstate(invalid="ignore"):
-            found += a <= coc + np.fmax(coc - b, 0) + step
-            found += b <= coc + np.fmax(coc - a, 0) + step
-    return found / 8
 
 
 def paper_matting(i: int, first: int, last: int, z: Callable[[int], float]) -> Matting:
