@@ -23,12 +23,15 @@ __all__ = ["CASES", "make_frame", "measure", "report"]
 
 Box = tuple[float, float, float, float, float]
 
+# All over the frame, and on no grid of tiles.
+_SPOTS = [(0.03 + 0.16 * (n % 6) + 0.011 * (n // 6), 0.02 + 0.16 * (n // 6) + 0.013 * (n % 6)) for n in range(36)]
 # Boxes as x0, y0, x1, y1 in shares of the frame and depth in metres; depth of the wall; focus distance.
 CASES: dict[str, tuple[list[Box], float, float]] = {
     "full": ([(0.0, 0.0, 0.33, 1.0, 1.0), (0.33, 0.0, 0.67, 1.0, 2.0)], 8.0, 2.0),
     "all in focus": ([], 2.0, 2.0),
     "only far blur": ([(0.0, 0.0, 0.5, 1.0, 2.0)], 8.0, 2.0),
     "10 % of tiles": ([(0.36, 0.36, 0.64, 0.64, 1.0)], 2.0, 2.0),
+    "36 spots": ([(x, y, x + 0.047, y + 0.047, 8.0) for x, y in _SPOTS], 2.0, 2.0),
 }
 # Of the nearest box, in px for 1024 px.
 _COC_PX = 20.0
@@ -36,7 +39,7 @@ _PEELS = 4
 
 
 def make_frame(size: int, boxes: list[Box], wall_m: float) -> LayeredFrame:
-    """A wall and boxes before it; the second peel is the wall behind them, two more are empty."""
+    """A wall with boxes before it, behind which the second peel is the wall, and holes in it; two peels are empty."""
     rng = np.random.default_rng(0)
 
     def paint() -> np.ndarray:
@@ -50,7 +53,8 @@ def make_frame(size: int, boxes: list[Box], wall_m: float) -> LayeredFrame:
     color[0], depth[0] = paint(), wall_m
     for x0, y0, x1, y1, at in boxes:
         place = (slice(int(y0 * size), int(y1 * size)), slice(int(x0 * size), int(x1 * size)))
-        color[1][place], depth[1][place] = color[0][place], depth[0][place]
+        if at < wall_m:
+            color[1][place], depth[1][place] = color[0][place], depth[0][place]
         color[0][place], depth[0][place] = paint()[place], at
     return LayeredFrame(color, depth, Camera(size, size, 40.0))
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Hashable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from .frame import LayeredFrame
 from .host.device import Traits
 from .host.passes import Access, Buffer, FrameProgram, Param, Pass, Role, read, read_write, write
 from .lens import Lens
-from .methods.base import EMPTY, FrameShape, Method, Plan, struct_scalar
+from .methods.base import EMPTY, TILE, FrameShape, Method, Plan, struct_scalar
 
 __all__ = [
     "BINS",
@@ -37,8 +37,7 @@ __all__ = [
     "plan_frame",
 ]
 
-# Constants of kernels/stats.cl.
-TILE = 16
+# As kernels/stats.cl has it.
 BINS = 64
 
 # What a plan may change a pixel by when nothing else is asked for, in linear units: one step of an 8-bit image.
@@ -59,6 +58,8 @@ _MOST_WINDOWS = 4
 _SIDE_SAVING = 0.45
 # Copying the image, whatever else is left out.
 _LEAST_SHARE = 0.01
+# A gap that no blur bridges, in px.
+_FAR = 65535
 # Windows begin and end at multiples of this, in px.
 _GRID = 32
 # Reaches are rounded up to these, in tiles.
@@ -259,12 +260,15 @@ class FramePlan(Plan):
         Predicted work as a share of that for everything.
     about : str
         What is planned, in one line.
+    gaps : ndarray, (rows of tiles, columns of tiles), uint16, optional
+        Where single tiles are made: the least distance in px from each tile to one of those, 0 in them.
     """
 
     decisions: tuple[Decision, ...] = ()
     error_bound: float = 0.0
     share: float = 1.0
     about: str = ""
+    gaps: NDArray[np.uint16] | None = field(default=None, compare=False, repr=False)
 
     def explain(self) -> str:
         """The plan in words, for people who have never seen the code."""
@@ -295,7 +299,7 @@ class FramePlan(Plan):
     def to_dict(self) -> dict[str, Any]:
         """Plain values for reports."""
         decisions = [
-            {**{field.name: getattr(one, field.name) for field in fields(one)}, "error_db": one.error_db}
+            {**{entry.name: getattr(one, entry.name) for entry in fields(one)}, "error_db": one.error_db}
             for one in self.decisions
         ]
         return {
@@ -324,6 +328,7 @@ class Layout(NamedTuple):
     inner: Hashable  # the method's own
     peels: int
     windows: tuple[tuple[int, int], ...] | None  # widths and heights; None: the whole frame, with no window
+    is_sparse: bool = False  # single tiles of the whole frame
 
 
 def everything(method: Method, frame: LayeredFrame, lens: Lens) -> FramePlan:
@@ -405,7 +410,7 @@ class _Planner:
     def plan(self) -> FramePlan:
         """Everything decided."""
         decisions = list(self._sides())
-        windows, focus = self._in_focus()
+        windows, tiles, focus = self._in_focus()
         decisions.append(focus)
         peels, which = self._peels(windows)
         decisions += which
@@ -424,6 +429,7 @@ class _Planner:
             "error_bound": bound,
             "peels_used": peels if windows != () else 0,
             "windows": sizes,
+            "tiles": None if tiles is None else int(tiles.sum()),
             "statistics": "last" if self.is_last else "frame",
             "scene": self.stats.summary(),
         }
@@ -432,13 +438,14 @@ class _Planner:
         for one in decisions:
             share *= 1.0 if one.kept else 1.0 - one.saving
         return FramePlan(
-            Layout(inner, peels, sizes),
+            Layout(inner, peels, sizes, tiles is not None),
             params,
             summary,
             tuple(decisions),
             bound,
             max(share, _LEAST_SHARE),
             self._about(),
+            None if tiles is None else self._gaps(tiles),
         )
 
     def _about(self) -> str:
@@ -515,15 +522,15 @@ class _Planner:
 
     # --- tiles ---
 
-    def _in_focus(self) -> tuple[tuple[Window, ...] | None, Decision]:
-        """The parts of the frame that have to be computed, None for all of it."""
+    def _in_focus(self) -> tuple[tuple[Window, ...] | None, NDArray[np.bool_] | None, Decision]:
+        """Windows of the frame that have to be computed, None for all of it; or of all of it the tiles that have to."""
         name = "tiles in focus"
         if getattr(self.method, "supersample", 1) > 1:
-            return None, Decision("whole frame", True, "the method averages the samples of a pixel by itself")
+            return None, None, Decision("whole frame", True, "the method averages the samples of a pixel by itself")
         if self.c1 == 0.0:
-            return (), Decision(name, False, "a pinhole blurs nothing: its image is copied", 0.0, 1.0)
+            return (), None, Decision(name, False, "a pinhole blurs nothing: its image is copied", 0.0, 1.0)
         if self.locality is None:
-            return None, Decision("whole frame", True, "what a pixel shows depends on its place in the image")
+            return None, None, Decision("whole frame", True, "what a pixel shows depends on its place in the image")
         bound = self._bounds()
         allowed = self.max_change / 2.0
         active = bound > allowed
@@ -534,22 +541,43 @@ class _Planner:
         error = float(bound[~active].max(initial=0.0))
         if not active.any():
             reason = f"all {active.size} tiles of {TILE} x {TILE} px show what a pinhole sees: they are copied"
-            return (), Decision(name, False, reason, error, 1.0)
+            return (), None, Decision(name, False, reason, error, 1.0)
         full = self.shape.width * self.shape.height
         windows = self._windows(active)
         area = sum(window.width * window.height for window in windows)
-        if area > _LARGEST_SHARE * full:
+        work = area / full
+        floor = self.locality.tiles_floor
+        if floor is not None and floor + (1.0 - floor) * share < min(work, _LARGEST_SHARE):
+            work = floor + (1.0 - floor) * share
+            reason = (
+                f"{1.0 - share:.0%} of the tiles show what a pinhole sees; the other {int(active.sum())} are made by "
+                f"themselves, of what can reach them"
+            )
+            return None, active, Decision(name, False, reason, error, 1.0 - work)
+        if work > _LARGEST_SHARE:
             reason = f"{share:.0%} of the tiles are blurred or within reach of a blur, too many to treat by themselves"
-            return None, Decision("whole frame", True, reason)
+            return None, None, Decision("whole frame", True, reason)
         if not self._may_cut(windows):
             reason = f"{share:.0%} of the tiles are blurred, but what they hide has to be guessed from all around"
-            return None, Decision("whole frame", True, reason)
+            return None, None, Decision("whole frame", True, reason)
         if self.locality.tail > 0.0:
             error += _TAIL_USES * self.locality.tail * self.contrast
-        parts = f"{len(windows)} window{'s' if len(windows) > 1 else ''} of {area / full:.0%} of the frame"
+        parts = f"{len(windows)} window{'s' if len(windows) > 1 else ''} of {work:.0%} of the frame"
         reason = f"{1.0 - share:.0%} of the tiles show what a pinhole sees; the rest is done in {parts}"
         slots = self.shape.layers * 20
-        return windows, Decision(name, False, reason, error, 1.0 - area / full, int((full - area) * slots))
+        return windows, None, Decision(name, False, reason, error, 1.0 - work, int((full - area) * slots))
+
+    def _gaps(self, tiles: NDArray[np.bool_]) -> NDArray[np.uint16]:
+        """Least distances in px from each tile to one of those that are made."""
+        gaps = np.where(tiles, 0, _FAR).astype(np.uint16)
+        farthest = float(self.stats.largest_coc(self.c1, self.c0).max())
+        assert self.locality is not None
+        reach = float(self.locality.reach_px(np.array([farthest]))[0])
+        near = tiles.astype(np.float64)
+        for ring in range(1, min(math.ceil(reach / TILE) + 2, max(tiles.shape) + 1)):
+            near = _spread(near, 1)
+            gaps = np.where((near > 0.0) & (gaps == _FAR), TILE * (ring - 1) + 1, gaps).astype(np.uint16)
+        return gaps
 
     def _bounds(self) -> NDArray[np.float64]:
         """What showing the pinhole's pixels can change, tile by tile, (ty, tx)."""
@@ -853,8 +881,8 @@ def planned_program(method: Method, shape: FrameShape, plan: FramePlan, traits: 
     """The passes of a planned frame; depends on ``plan.structure`` only."""
     layout = plan.structure
     assert isinstance(layout, Layout)
-    used = shape._replace(layers=layout.peels)
-    if layout.windows is None:
+    used = shape._replace(layers=layout.peels, is_sparse=layout.is_sparse)
+    if layout.windows is None and not layout.is_sparse:
         return method.program(used, Plan(layout.inner, plan.params, {}), traits)
     out_height, out_width = shape.output_size
     one = (1,) if traits.is_cpu else None
@@ -874,7 +902,12 @@ def planned_program(method: Method, shape: FrameShape, plan: FramePlan, traits: 
             traffic_bytes=out_height * out_width * 32,
         )
     ]
-    for number, (width, height) in enumerate(layout.windows):
+    if layout.is_sparse:
+        program = method.program(used, Plan(layout.inner, plan.params, {}), traits)
+        inputs |= {name: one for name, one in program.buffers.items() if one.role is Role.INPUT and name != "color"}
+        own = [one for name, one in program.buffers.items() if name not in inputs and name != "image"]
+        return FrameProgram.of([*inputs.values(), *buffers, *own], [*passes, *program.passes])
+    for number, (width, height) in enumerate(layout.windows or ()):
         window = Param(f"window_{number}", _WINDOW)
         part = used._replace(width=width, height=height, guard_px=0)
         program = method.program(part, Plan(layout.inner, plan.params, {}), traits)

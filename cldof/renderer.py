@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,8 +87,16 @@ class _DeviceFrame:
     preparation: Batch  # made inv_depth, and owns it
     ready: Any  # event
     stats: _ComingStats | None  # None: planning is off
-    plans: dict[Any, FramePlan] = field(default_factory=dict)  # by method and lens
+    plans: dict[Any, _Planned] = field(default_factory=dict)  # by method and lens
     last_use: Any = None  # event
+
+
+class _Planned(NamedTuple):
+    """A plan, and what of it the device has to know."""
+
+    plan: FramePlan
+    gaps: HostInput | None
+    is_kept: bool  # with the frame, for the same lens again
 
 
 class _ComingStats:
@@ -172,12 +180,12 @@ class PendingResult:
         submission: Submission,
         event: Any,
         image: NDArray[np.float32],
-        plan: FramePlan,
+        planned: _Planned,
         started: float,
         profile: bool,
         report: Callable[[], None],
     ) -> None:
-        self._submission, self._event, self._image, self._plan = submission, event, image, plan
+        self._submission, self._event, self._image, self._planned = submission, event, image, planned
         self._report = report  # tells the renderer that the frame failed
         self._started, self._profile = started, profile
         self._chosen: _Chosen | None = None
@@ -222,7 +230,7 @@ class PendingResult:
             wall_ms = (time.perf_counter() - self._started) * 1e3
             if self._chosen is not None:
                 self._chosen.took(wall_ms)
-            self._result = Result(self._image, timings, wall_ms, self._plan, choice)
+            self._result = Result(self._image, timings, wall_ms, self._planned.plan, choice)
         return self._result
 
 
@@ -381,16 +389,19 @@ class Renderer:
         self, held: _DeviceFrame, lens: Lens, method: Method, image: NDArray[np.float32], started: float
     ) -> tuple[PendingResult, bool]:
         """Enqueue a frame, and tell whether what it needs was made just now."""
-        plan = self._plan(held, lens, method)
+        planned = self._plan(held, lens, method)
+        plan = planned.plan
         ring, is_new = self._ring(held.shape, plan, method)
-        inputs, waits = self._inputs(held, ring.program, method)
+        inputs, waits = self._inputs(held, ring.program, method, planned.gaps)
         submission = ring.submit(inputs, plan.params, waits)
         held.last_use = submission.event
+        if not planned.is_kept:
+            self._free(planned, submission.event)
         output = "image" if self._supersample == 1 else "resolved"
         download = self.device.pool.download(submission.batch.output(output), image, [submission.event])
         submission.batch.hold(download)
         is_profiling = self.device.is_profiling
-        return PendingResult(submission, download, image, plan, started, is_profiling, self._note_failure), is_new
+        return PendingResult(submission, download, image, planned, started, is_profiling, self._note_failure), is_new
 
     def stats(self, frame: LayeredFrame) -> SceneStats:
         """What the planner knows of a frame; uploads it, if need be, and waits for the answer.
@@ -449,22 +460,29 @@ class Renderer:
         self._latest = held.stats.wait()
         return self._latest, False
 
-    def _plan(self, held: _DeviceFrame, lens: Lens, method: Method) -> FramePlan:
-        """What to compute; kept with the frame for the lenses last seen."""
+    def _plan(self, held: _DeviceFrame, lens: Lens, method: Method) -> _Planned:
+        """What to compute; kept with the frame for the lenses last seen, unless it is by another frame's statistics."""
         key = (method, lens)
-        plan = held.plans.get(key)
-        if plan is None:
-            if held.stats is None:
-                plan = everything(method, held.frame, lens)
-            else:
-                stats, is_last = self._known(held)
-                plan = plan_frame(method, held.frame, lens, stats, self.device.traits, self._max_change, is_last)
-                if is_last:
-                    return plan
+        planned = held.plans.get(key)
+        if planned is not None:
+            return planned
+        is_last = False
+        if held.stats is None:
+            plan = everything(method, held.frame, lens)
+        else:
+            stats, is_last = self._known(held)
+            plan = plan_frame(method, held.frame, lens, stats, self.device.traits, self._max_change, is_last)
+        gaps = None if plan.gaps is None else self.device.pool.to_device(plan.gaps, "upload gaps")
+        planned = _Planned(plan, gaps, not is_last)
+        if planned.is_kept:
             while len(held.plans) >= _KEPT_PLANS:
-                held.plans.pop(next(iter(held.plans)))
-            held.plans[key] = plan
-        return plan
+                self._free(held.plans.pop(next(iter(held.plans))), held.last_use)
+            held.plans[key] = planned
+        return planned
+
+    def _free(self, planned: _Planned, last_use: Any) -> None:
+        if planned.gaps is not None:
+            self.device.pool.free_input(planned.gaps, last_use)
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
@@ -533,12 +551,18 @@ class Renderer:
         self._frames[key] = held
         return held
 
-    def _inputs(self, held: _DeviceFrame, program: FrameProgram, method: Method) -> tuple[dict[str, Any], list[Any]]:
-        """What the program reads of the frame, uploaded when it is first asked for, and what to wait for."""
+    def _inputs(
+        self, held: _DeviceFrame, program: FrameProgram, method: Method, gaps: HostInput | None
+    ) -> tuple[dict[str, Any], list[Any]]:
+        """What the program reads of frame and plan, uploaded when it is first asked for, and what to wait for."""
         buffers, waits = {}, [held.ready]
         for name in (name for name, buffer in program.buffers.items() if buffer.role is Role.INPUT):
             if name == "inv_depth":
                 buffers[name] = held.preparation.output(name)
+                continue
+            if name == "gaps" and gaps is not None:
+                buffers[name] = gaps.buffer
+                waits += gaps.waits
                 continue
             if name not in held.arrays:
                 if name not in held.frame.inputs:
@@ -557,6 +581,8 @@ class Renderer:
             _, old = self._frames.popitem(last=False)
             for array in old.arrays.values():
                 self.device.pool.free_input(array, old.last_use)
+            for planned in old.plans.values():
+                self._free(planned, old.last_use)
             if old.last_use is not None:
                 old.preparation.hold(old.last_use)
             if preparation is None and old.shape == shape:

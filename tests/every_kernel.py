@@ -84,12 +84,22 @@ def _mostly_sharp() -> LayeredFrame:
     return LayeredFrame(color, depth, Camera(126, 96, 40.0))
 
 
+def _scattered() -> LayeredFrame:
+    """Specks out of focus in opposite corners: single tiles where a method can make them."""
+    depth = np.full((1, 96, 126), 2.0, np.float32)
+    depth[:, 4:10, 4:10] = depth[:, -10:-4, -10:-4] = 9.0
+    color = np.random.default_rng(1).random((1, 96, 126, 4)).astype(np.float32)
+    color[..., 3] = 1.0
+    return LayeredFrame(color, depth, Camera(126, 96, 40.0))
+
+
 FRAMES: dict[str, Callable[[], LayeredFrame]] = {
     "opaque": lambda: noise_frame(WIDTH, HEIGHT, 3, guard_px=3),
     "void": lambda: noise_frame(WIDTH - 1, HEIGHT - 1, 3, opaque=False),
     "one": lambda: noise_frame(7, 5, 1),
     "pixel": lambda: noise_frame(1, 1, 1),
     "sharp": _mostly_sharp,
+    "scattered": _scattered,
     "shaded": lambda: shaded_frame(WIDTH, HEIGHT),
 }
 

@@ -47,6 +47,10 @@
 #ifndef LIGHTFIELD_SHADED
 #define LIGHTFIELD_SHADED 0
 #endif
+/* 1: only the tiles of 16 x 16 px that `gaps` asks for are made, and the rest of the image is left as it is. */
+#ifndef LIGHTFIELD_SPARSE
+#define LIGHTFIELD_SPARSE 0
+#endif
 /* 1: 64-bit atomic minimum. */
 #ifndef LIGHTFIELD_PACKED
 #define LIGHTFIELD_PACKED 0
@@ -76,6 +80,8 @@
 #define TILE 8               /* pixels each way, for culling */
 #define CULL_RINGS 6         /* tiles round a tile that may hide it: CoC up to 45 px apart */
 #define SEGMENT 32           /* pixels of a row that one item of lightfield_synthesize makes */
+#define GAP_TILE 16          /* px, of the tiles that the planner asks for */
+#define FOOTPRINT_PX 7.0f    /* a slot covers nothing farther from where it stands than its CoC and this */
 #define MIN_WEIGHT 1e-4f     /* of all views together: less is a pixel that no view sees */
 #define LANES ((int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 
@@ -99,6 +105,26 @@ typedef struct {
 } LightfieldLens;
 
 static inline float absolute(float v) { return v < 0.0f ? -v : v; }
+
+#if LIGHTFIELD_SPARSE
+/* Gaps of the tiles that row y of the frame goes through. */
+static inline const __global ushort *gaps_of_row(const __global ushort *gaps, LightfieldSize size, int y)
+{
+    return gaps + (y / GAP_TILE) * ((size.width + GAP_TILE - 1) / GAP_TILE);
+}
+
+/* Whether any pixel of columns x0 to before x1 of a row is asked for. */
+static inline int is_asked_for(const __global ushort *row_gaps, int x0, int x1)
+{
+    for (int t = x0 / GAP_TILE; t * GAP_TILE < x1; t++)
+        if (row_gaps[t] == 0) return 1;
+    return 0;
+}
+
+#define GAPS_PARAM const __global ushort *restrict gaps,
+#else
+#define GAPS_PARAM
+#endif
 
 /* An order that grows with w for every float, turned round: the nearest slot has the smallest key. */
 static inline uint depth_key(float w)
@@ -328,6 +354,7 @@ static inline int16 edge_code16(float16 d)
  * reads   inv_depth  float[peels][height][pitch]     1/m
  *         color      float[peels][height][width][4]  alpha, with LIGHTFIELD_GLASS
  *         tile_open  uchar[peels][tiles_y][tiles_x]
+ *         gaps       ushort[][]  px from a tile of the frame to the nearest that is asked for; with LIGHTFIELD_SPARSE
  * writes  slot_at    uint[peels][height][pitch]   where in inv_depth the slot stands
  *         slot_key   uint[peels][height][pitch]   depth_key
  *         slot_coc   float[peels][height][pitch]  CoC in 1/256 px
@@ -341,7 +368,7 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
                                __global uchar *restrict slot_plane, __global int *restrict slot_count,
                                __global uchar *restrict cells, const __global float *restrict inv_depth,
                                const __global float *restrict color, const __global uchar *restrict tile_open,
-                               LightfieldSize size, LightfieldLens lens)
+                               GAPS_PARAM LightfieldSize size, LightfieldLens lens)
 {
     const int line = get_global_id(0);
     if (line >= size.peels * size.height) return;
@@ -380,6 +407,12 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
         int is_open = 0;
         for (int t = x0 / TILE; t < x0 / TILE + 16 / TILE && t < size.tiles_x; t++) is_open |= open[t];
         if (!is_open) continue;
+#if LIGHTFIELD_SPARSE
+        const int16 arrives = absolute16(c) + FOOTPRINT_PX >= (float)gaps_of_row(gaps, size, y)[x0 / GAP_TILE];
+        const int8 eight = arrives.lo | arrives.hi;
+        const int4 four = eight.lo | eight.hi;
+        if (!(four.x | four.y | four.z | four.w)) continue;
+#endif
         const int16 is_plain = is_here & (left >= 0.0f) & (right >= 0.0f) & (above >= 0.0f) & (below >= 0.0f)
                                & (absolute16(d_left) <= SAME_SURFACE_PX) & (absolute16(d_right) <= SAME_SURFACE_PX)
                                & (absolute16(d_above) <= SAME_SURFACE_PX) & (absolute16(d_below) <= SAME_SURFACE_PX);
@@ -389,6 +422,9 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
             const int x = x0 + i;
             const float depth = ((const float *)&w)[i];
             if (depth < 0.0f || !open[x / TILE]) continue;
+#if LIGHTFIELD_SPARSE
+            if (!((const int *)&arrives)[i]) continue;
+#endif
 #if LIGHTFIELD_VOID
             if (depth > 0.0f && is_clear(color + ((size_t)line * size.width + x) * 4)) continue;
 #endif
@@ -474,13 +510,14 @@ static inline int16 load_ints(const __global uint *p) { return as_int16(load_qua
  * source  Yu, Wang & Yu 2010, section 3.2, eq. 4
  * reads   slot_*   see lightfield_slots
  *         views    float4[]  see LightfieldView
+ *         gaps     see lightfield_slots; pixels that are not asked for are left undefined
  * writes  winners  ulong[views][planes][out_height][out_pitch]  columns from out_width on are left alone
  * range   2-D, one item per view and band of band_rows rows, any local size */
 __kernel void lightfield_views(__global ulong *restrict winners, const __global uint *restrict slot_at,
                                const __global uint *restrict slot_key, const __global float *restrict slot_coc,
                                const __global uint *restrict slot_edge, const __global uchar *restrict slot_plane,
                                const __global int *restrict slot_count, const __global LightfieldView *restrict views,
-                               LightfieldSize size, LightfieldLens lens, int first_view, int band_rows)
+                               GAPS_PARAM LightfieldSize size, LightfieldLens lens, int first_view, int band_rows)
 {
     const int view = get_global_id(0);
     const int top = (int)get_global_id(1) * band_rows;
@@ -491,8 +528,19 @@ __kernel void lightfield_views(__global ulong *restrict winners, const __global 
     __global ulong *own = winners + (size_t)view * size.planes * plane_size;
 
     for (int p = 0; p < size.planes; p++)
-        for (int y = top; y < bottom; y++)
-            for (int x = 0; x < size.out_width; x++) own[p * plane_size + (size_t)y * size.out_pitch + x] = ~0ul;
+        for (int y = top; y < bottom; y++) {
+            __global ulong *row = own + p * plane_size + (size_t)y * size.out_pitch;
+#if LIGHTFIELD_SPARSE
+            const __global ushort *row_gaps = gaps_of_row(gaps, size, y + size.guard);
+            for (int first = 0; first < size.out_width; first += SEGMENT) {
+                const int end = first + SEGMENT < size.out_width ? first + SEGMENT : size.out_width;
+                if (!is_asked_for(row_gaps, first + size.guard, end + size.guard)) continue;
+                for (int x = first; x < end; x++) row[x] = ~0ul;
+            }
+#else
+            for (int x = 0; x < size.out_width; x++) row[x] = ~0ul;
+#endif
+        }
 
     const int first_row = top + size.guard - lens.reach, end_row = bottom + size.guard + lens.reach;
     for (int y = first_row < 0 ? 0 : first_row; y < end_row && y < size.height; y++) {
@@ -1005,6 +1053,7 @@ static inline float4 pinhole(const __global float *color, LightfieldSize size, i
  *         inv_depth  float[peels][height][pitch]
  *         cells      uchar[peels][height][pitch]
  *         views      LightfieldView[]
+ *         gaps       see lightfield_slots
  *         mips, mip_depths  see lightfield_shrink; with LIGHTFIELD_LEVELS
  *         mip_table  int4[LIGHTFIELD_LEVELS]  width, height and first pixel, of level 1 and up
  *         surface, lighting, environment  see shading.cl; with LIGHTFIELD_SHADED, where `color` lacks what is mirrored
@@ -1017,6 +1066,7 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
                                     __global float *restrict seen, const __global uint2 *restrict winners,
                                     const __global float *restrict color, const __global float *restrict inv_depth,
                                     const __global uchar *restrict cells, const __global LightfieldView *restrict views,
+                                    GAPS_PARAM
 #if LIGHTFIELD_LEVELS
                                     const __global float *restrict mips, const __global float *restrict mip_depths,
                                     const __global int4 *restrict mip_table,
@@ -1032,6 +1082,10 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
     const int x0 = SEGMENT * (int)get_global_id(0), y = get_global_id(1);
     if (x0 >= size.out_width || y >= size.out_height) return;
     const int n = size.out_width - x0 < SEGMENT ? size.out_width - x0 : SEGMENT;
+#if LIGHTFIELD_SPARSE
+    const __global ushort *row_gaps = gaps_of_row(gaps, size, y + size.guard);
+    if (!is_asked_for(row_gaps, x0 + size.guard, x0 + n + size.guard)) return;
+#endif
     const size_t here = (size_t)y * size.out_pitch + x0, plane_size = (size_t)size.out_height * size.out_pitch;
     float4 total[SEGMENT];
     float weights[SEGMENT];
@@ -1102,6 +1156,9 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
             seen[here + i] = weights[i];
             continue;
         }
+#if LIGHTFIELD_SPARSE
+        if (row_gaps[(x0 + i + size.guard) / GAP_TILE] != 0) continue;
+#endif
         float4 pixel = weights[i] > MIN_WEIGHT ? total[i] * (1.0f / weights[i])
                                                : pinhole(PINHOLE_COLOR, size, x0 + i + size.guard, y + size.guard);
         pixel.w = pixel.w < 1.0f ? pixel.w : 1.0f;

@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 from ..frame import LayeredFrame
 from ..host.device import Traits
-from ..host.passes import FrameProgram
+from ..host.passes import Buffer, FrameProgram, Role
 from ..lens import Lens
 
-__all__ = ["EMPTY", "FrameShape", "Locality", "Method", "Plan", "row_pitch", "struct_scalar"]
+__all__ = ["EMPTY", "TILE", "FrameShape", "Locality", "Method", "Plan", "row_pitch", "struct_scalar"]
 
 Array = NDArray[np.float64]
+
+TILE = 16
+"""Pixels each way of the tiles that the planner looks at and asks for, as kernels/stats.cl has it."""
 
 EMPTY = -1.0
 """Inverse depth of a slot with nothing in it, as kernels/common.clh has it."""
@@ -34,6 +37,7 @@ class FrameShape(NamedTuple):
     has_glass: bool
     surface: tuple[str, ...] = ()  # what the frame has beside colour and depth: LayeredFrame.inputs
     is_glossy: bool = False
+    is_sparse: bool = False  # only the tiles that the input ``gaps`` asks for are made
 
     @classmethod
     def of(cls, frame: LayeredFrame) -> FrameShape:
@@ -58,6 +62,19 @@ class FrameShape(NamedTuple):
     def nothing(self) -> np.float32:
         """Inverse depth of slots with neither light nor coverage: where the image is not opaque, the void's."""
         return np.float32(EMPTY if self.is_opaque else 0.0)
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Rows and columns of the planner's tiles."""
+        return -(-self.height // TILE), -(-self.width // TILE)
+
+    @property
+    def gaps(self) -> Buffer:
+        """The input of sparse frames, ushort[rows of tiles][columns of tiles].
+
+        Pixels between a tile and the nearest one that is asked for, 0 in those.
+        """
+        return Buffer("gaps", math.prod(self.tiles) * 2, Role.INPUT)
 
     @property
     def output_size(self) -> tuple[int, int]:
@@ -133,6 +150,9 @@ class Locality:
         So near to the edges of the frame (not of the image) it guesses, too.
     engines : str
         Which blur engines run on this device, in words, where there is a choice.
+    tiles_floor : float, optional
+        For methods that can make single tiles of a frame (``FrameShape.is_sparse``): the share of the work that is left
+        when there are few. None: it is all or a part of its own.
     """
 
     align_px: int
@@ -147,6 +167,7 @@ class Locality:
     guesses_nearer_than_px: float = -math.inf
     guesses_at_edges_px: float = 0.0
     engines: str = ""
+    tiles_floor: float | None = None
 
 
 class Method(Protocol):
@@ -155,7 +176,8 @@ class Method(Protocol):
     Passes may read the inputs ``color`` (float[layers][height][width][4]) and ``inv_depth``
     (float[layers][height][pitch], see kernels/frame.cl), and of frames that have them ``normal``, ``albedo``,
     ``specular`` (float[layers][height][width][3]), ``shininess`` (float[layers][height][width]), ``lighting`` and
-    ``environment`` (see kernels/shading.clh). They write the output ``image`` (float[output height][output width][4]).
+    ``environment`` (see kernels/shading.clh), and of sparse shapes ``gaps``. They write the output ``image``
+    (float[output height][output width][4]), of sparse shapes into what the pinhole image is.
     """
 
     name: str

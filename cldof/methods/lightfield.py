@@ -53,6 +53,8 @@ _NEGLIGIBLE_COC_PX = 1e-3
 # Work-items that a CPU core should get, so that none waits for the last one.
 _ITEMS_PER_CORE = 2
 _WINNER_BYTES = 8
+# Share of the work that few tiles leave: finding slots that reach them, mips of all layers.
+_TILES_FLOOR = 0.1
 # Pixels along a silhouette that say where in its pixel it runs, and one beside it.
 _STAIRCASE_PX = 17
 
@@ -210,6 +212,7 @@ class LightField:
             reach_px=lambda coc: coc + _FOOTPRINT_PX + mips,
             rim_px=1,  # rays take their samples all over a pixel, and interpolate
             leak=lambda coc: np.where(coc < step, 2.0 * coc, np.minimum(3.0 * coc + 2.0 / views.total, 1.0)),
+            tiles_floor=_TILES_FLOOR,
         )
 
     def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
@@ -296,6 +299,10 @@ class _Builder:
             Buffer("seen", pixels * 4),
         ]
         self.passes: list[Pass] = []
+        self.gaps: tuple[Any, ...] = ()
+        if shape.is_sparse:
+            self.buffers.append(shape.gaps)
+            self.gaps = (read("gaps"),)
         # What rays and the pyramid look up; see kernels/shading.cl.
         self.color = "matte" if views.is_shaded else "color"
         self.lens = Param("lens", _LENS)
@@ -314,6 +321,7 @@ class _Builder:
             ("LIGHTFIELD_LOOKUP", _LOOKUPS.index(method.lookup)),
             ("LIGHTFIELD_LEVELS", views.levels),
             ("LIGHTFIELD_PACKED", int(warp == "packed")),
+            ("LIGHTFIELD_SPARSE", int(shape.is_sparse)),
             ("LIGHTFIELD_SHADED", int(views.is_shaded)),
             *(shading_defines(shape) if views.is_shaded else ()),
         )
@@ -325,6 +333,7 @@ class _Builder:
             (
                 *map(write, (*_SLOTS, "cells")),
                 *map(read, ("inv_depth", "color", "tile_open")),
+                *self.gaps,
                 self.size,
                 self.lens,
             ),
@@ -394,6 +403,7 @@ class _Builder:
             (
                 write("winners"),
                 *map(read, (*_SLOTS, "views")),
+                *self.gaps,
                 self.size,
                 self.lens,
                 np.int32(first),
@@ -425,10 +435,11 @@ class _Builder:
         self._add(
             "lightfield_synthesize",
             (
-                write("image"),
+                (read_write if self.gaps else write)("image"),
                 access("sum"),
                 access("seen"),
                 *map(read, ("winners", self.color, "inv_depth", "cells", "views")),
+                *self.gaps,
                 *mips,
                 *shading,
                 self.size,

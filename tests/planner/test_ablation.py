@@ -42,6 +42,30 @@ def test_windows_of_guard_bands_and_odd_sizes(pair: Pair, opaque: bool) -> None:
     check(pair, frame, lens_for(frame, 4.0, 2.0))
 
 
+# Methods that make single tiles of a frame.
+SPARSE = ("lightfield",)
+
+
+@pytest.mark.parametrize("guard", [0, 21])
+@pytest.mark.parametrize("far_m", [9.0, 1.3])
+def test_scattered_tiles(pair: Pair, far_m: float, guard: int) -> None:
+    """Windows around these would be all of the frame. Elsewhere it is the pinhole's image."""
+    boxes = [(x, y, x + 9, y + 11, far_m) for x, y in ((30, 25), (210, 22), (300, 190), (60, 150), (170, 90))]
+    inner = wall_frame(333, 222, boxes)
+    camera = inner.camera.__class__(333 - 2 * guard, 222 - 2 * guard, 40.0)
+    frame = LayeredFrame(inner.color, inner.depth, camera, guard_px=guard)
+    lens = lens_for(frame, 3.0, 2.0)
+    plan = check(pair, frame, lens)
+    if pair[0].method.name not in SPARSE:
+        return
+    assert plan.gaps is not None
+    assert 0 < plan.summary["tiles"] < 0.7 * plan.gaps.size
+    is_made = (plan.gaps == 0).repeat(16, 0).repeat(16, 1)[guard : 222 - guard, guard : 333 - guard]
+    planned, full = (renderer.render(frame, lens).image for renderer in pair)
+    np.testing.assert_array_equal(planned[is_made], full[is_made])
+    np.testing.assert_array_equal(planned[~is_made], frame.pinhole_image()[~is_made])
+
+
 def test_all_in_focus(pair: Pair) -> None:
     frame = wall_frame(70, 50, [])
     plan = check(pair, frame, lens_for(frame, 9.0, 2.0))

@@ -10,6 +10,7 @@ from cldof import Camera, InputError, LayeredFrame, Lens, Renderer
 from cldof.host.device import DeviceInfo
 from cldof.planner import Decision, FramePlan, _boxes, _spread, peels_needed
 from tests.frames import noise_frame
+from tests.planner.pairs import ROUNDING
 from tests.planner.scenes import lens_for, wall_frame
 
 
@@ -25,6 +26,25 @@ def test_spread_is_the_maximum_of_a_square() -> None:
             for y in range(7)
         ]
         np.testing.assert_array_equal(_spread(values, radius), expected)
+
+
+def test_gaps_are_distances_to_what_is_made(device_info: DeviceInfo) -> None:
+    """No pixel of a tile is nearer to one that is made than its gap; and not by a pixel more is it understated."""
+    frame = wall_frame(333, 222, [(30, 25, 39, 36, 1.3), (300, 190, 309, 201, 1.3)])
+    with Renderer("lightfield", device=device_info.index) as renderer:
+        plan = renderer.render(frame, lens_for(frame, 9.0, 2.0)).plan
+        assert plan.gaps is not None
+        gaps = plan.gaps
+        made = np.argwhere(gaps == 0)
+        for at, gap in np.ndenumerate(gaps):
+            apart = int(np.abs(made - at).max(axis=1).min())
+            exact = 16 * (apart - 1) + 1 if apart else 0
+            assert gap == exact or (gap > 64 and exact > 9.0 + 6.0)
+        # More lenses than plans are kept, then the first again: what was uploaded for it is gone.
+        first = renderer.render(frame, lens_for(frame, 9.0, 2.0)).image
+        for step in range(20):
+            renderer.render(frame, lens_for(frame, 9.0 - 0.1 * step, 2.0))
+        np.testing.assert_array_equal(renderer.render(frame, lens_for(frame, 9.0, 2.0)).image, first)
 
 
 def test_boxes_hold_all_and_are_cut_along_gaps() -> None:
@@ -172,17 +192,18 @@ def test_planning_can_be_off(device_info: DeviceInfo) -> None:
         Renderer(device=device_info.index, statistics="some")
 
 
-def test_by_the_frame_before_nothing_waits(device_info: DeviceInfo) -> None:
+@pytest.mark.parametrize("method", ["gather", "lightfield"])
+def test_by_the_frame_before_nothing_waits(device_info: DeviceInfo, method: str) -> None:
     """A box that moves by less than a tile per frame is right without waiting for statistics."""
     frames = [wall_frame(300, 200, [(100 + 3 * n, 90, 140 + 3 * n, 130, 1.0)]) for n in range(6)]
     lens = lens_for(frames[0], 4.0, 2.0)
-    with Renderer("gather", device=device_info.index) as renderer:
+    with Renderer(method, device=device_info.index, planned=method == "gather") as renderer:
         expected = [renderer.render(frame, lens).image for frame in frames]
-    with Renderer("gather", device=device_info.index, statistics="last", frames_in_flight=3) as renderer:
+    with Renderer(method, device=device_info.index, statistics="last", frames_in_flight=3) as renderer:
         pending = [renderer.render_async(frame, lens) for frame in frames]
         results = [one.result() for one in pending]
     for result, image in zip(results, expected, strict=True):
-        np.testing.assert_array_equal(result.image, image)
+        np.testing.assert_allclose(result.image, image, atol=0.0 if method == "gather" else ROUNDING)
     kinds = [result.plan.summary["statistics"] for result in results]
     assert kinds[0] == "frame"
     for result in results:

@@ -45,7 +45,11 @@ SUITES: dict[str, list[list[str]]] = {
     "frame.clh": [["tests/kernels/test_frame.py", "tests/planner/test_stats.py"]],
     "gather.cl": [["tests/kernels/test_gather.py", "tests/methods/test_gather.py"]],
     "layered.cl": [["tests/methods/test_layered.py"]],
-    "lightfield.cl": [["tests/kernels/test_lightfield.py"], ["tests/methods/test_lightfield.py"]],
+    "lightfield.cl": [
+        ["tests/kernels/test_lightfield.py"],
+        ["tests/methods/test_lightfield.py"],
+        ["tests/planner/test_ablation.py::test_scattered_tiles"],
+    ],
     "multiview.cl": [
         ["tests/kernels/test_multiview.py"],
         ["tests/methods/test_multiview.py", "-k", "not dense_marching and not dense_sampling"],
@@ -279,5 +283,8 @@ MUTANTS: list[Mutant] = [
         ("sign", "const float to_x = -lens.c1 * v_x, to_y = -lens.c1 * v_y;", "const float to_x = lens.c1 * v_x, to_y = -lens.c1 * v_y;"),
         ("drop", "&& color[(row * size.width + at_x) * 4 + 3] >= OPAQUE_ALPHA)", ")"),
         ("clamp", "    t = t < 0.0f ? 0.0f : t;\n    if (!(t < 1e12f)) return 0;", "    if (!(t < 1e12f)) return 0;"),
+        ("off by one", "for (int t = x0 / GAP_TILE; t * GAP_TILE < x1; t++)", "for (int t = x0 / GAP_TILE; t * GAP_TILE < x0; t++)"),
+        ("weight", "#define FOOTPRINT_PX 7.0f", "#define FOOTPRINT_PX (-2.0f)"),
+        ("drop", "if (row_gaps[(x0 + i + size.guard) / GAP_TILE] != 0) continue;", ""),
     ),
 ]  # fmt: skip
