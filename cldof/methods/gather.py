@@ -36,6 +36,7 @@ _MAX_SAMPLES = 4096
 _EVEN_PX = 12.0  # blurs wider than this get more samples, no farther apart
 _MOST = 4  # times as many
 _REACH = {"disc": 1.0, "gaussian": 1.5}  # CoC radii; 3 sigma
+_TOTAL = 1024.0  # weights above 1, or what is as dark as float32 goes would be flushed to 0
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 _BUILT_PX = 64.0  # taps of wider blurs are made from those of narrower ones
@@ -188,7 +189,7 @@ def gather_taps(samples: int, kernel: str = "disc") -> tuple[NDArray[np.void], N
 def _stencil(
     wider: NDArray[np.int64], radius: float, samples: int, kernel: str, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Pixels (n, 2) that stand for a CoC, those of a wider one's that lie in it among them, and weights of sum 1."""
+    """Pixels (n, 2) that stand for a CoC, a wider one's that lie in it among them; weights of sum `_TOTAL`."""
     more = min(max(1.0, (radius / _EVEN_PX) ** 2), _MOST) * _REACH[kernel] ** 2
     count, reach = min(round(more * samples), _MAX_SAMPLES), _REACH[kernel] * radius + 0.5
     pixels = wider[np.hypot(*wider.T) < reach]
@@ -213,7 +214,7 @@ def _stencil(
         weights = area * np.exp(-2.0 * (distance / radius) ** 2)
     else:
         weights = _rim(distance, area, 0.5 * (radius**2 - RADII[0] ** 4 / radius**2))
-    return pixels, weights / weights.sum()
+    return pixels, weights * (_TOTAL / weights.sum())
 
 
 def _fill(pixels: NDArray[np.int64], places: NDArray[np.int64], reach: float, count: int) -> NDArray[np.int64]:

@@ -62,7 +62,7 @@ def test_taps_stand_for_the_disc(count: int) -> None:
     before = None
     for step, radius in enumerate(RADII[RADII < 200.0]):
         here = taps[first[step] : first[step + 1]]
-        weight, end = here["weight"].astype(float), here["weight"].astype(float) + here["change"]
+        weight, end = here["weight"].astype(float) / 1024.0, (here["weight"].astype(float) + here["change"]) / 1024.0
         assert weight.min() >= 0.0
         assert end.min() >= -1e-9
         assert weight.sum() == pytest.approx(1.0, abs=1e-5)
