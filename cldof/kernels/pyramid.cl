@@ -28,6 +28,13 @@
 /* Below this coverage the result is 0 rather than a quotient of rounding errors. */
 #define PYRAMID_MIN_COVERAGE 1e-4f
 
+/* What slots one and two sigma around count for in a surface's breadth; the rest is the pixel's own. Beside a straight edge
+ * that makes 0.64, 0.79, 0.87, 0.96 and 1 up to 0.7, 1, 1.4, 2 and past 2 sigma from it, where a Gaussian leaves 0.5 to
+ * 0.76, 0.84, 0.92, 0.98. It must be 1 only where nothing is lost: what counts as broad there vanishes at once when focus
+ * passes. */
+#define PYRAMID_NEAR_RING 0.6f
+#define PYRAMID_FAR_RING 0.35f
+
 /* 1: matting functions as published, linear in z. 0: linear in the CoC, entered early only where a surface slopes. */
 #ifndef PYRAMID_PAPER
 #define PYRAMID_PAPER 0
@@ -155,14 +162,43 @@ __kernel void pyramid_flatten(__global float *restrict flat, __global float *res
     }
 }
 
+/* How much of two opposite slots belongs to the surface of the slot w between them, or hides it: all of what is nearer
+ * or on a plane through the three, none of what is a whole interval (1 / scale) farther. That is what of a slot stands in
+ * the sub-image before while w enters its own, and it changes evenly with depth: nothing may switch while focus moves. */
+static inline float16 shared_pair(float16 w, float16 a, float16 b, float scale)
+{
+    const float16 zero = (float16)(0.0f);
+    float16 a_nearer = a > w ? a - w : zero, b_nearer = b > w ? b - w : zero;
+    float16 of_a = clamp01(1.0f - (w - a - b_nearer) * scale), of_b = clamp01(1.0f - (w - b - a_nearer) * scale);
+    return (a >= 0.0f ? of_a : zero) + (b >= 0.0f ? of_b : zero);
+}
+
+/* The same of eight slots `far` pixels away from each of the 16 slots w from pixel (x, y) on, as a share. */
+static inline float16 ring_of(const __global float *inv_depth, float16 w, int x, int y, PyramidSize size, int far,
+                              float scale)
+{
+    const int near = far * 7 / 10 > 1 ? far * 7 / 10 : 1, last = size.height - 1, pitch = size.pitch;
+    const __global float *here = inv_depth + (size_t)y * pitch;
+    const __global float *up = inv_depth + (size_t)clamp_index(y - near, last) * pitch;
+    const __global float *down = inv_depth + (size_t)clamp_index(y + near, last) * pitch;
+    const __global float *top = inv_depth + (size_t)clamp_index(y - far, last) * pitch;
+    const __global float *bottom = inv_depth + (size_t)clamp_index(y + far, last) * pitch;
+    const int width = size.width;
+    float16 found = shared_pair(w, row_of_slots(here, x - far, width), row_of_slots(here, x + far, width), scale);
+    found += shared_pair(w, load_quad(top + x), load_quad(bottom + x), scale);
+    found += shared_pair(w, row_of_slots(up, x - near, width), row_of_slots(down, x + near, width), scale);
+    found += shared_pair(w, row_of_slots(up, x + near, width), row_of_slots(down, x - near, width), scale);
+    return found * 0.125f;
+}
+
 /* pyramid_slope: change of inverse depth from one pixel to the next, the lesser of both sides, so that a silhouette
  * does not count as a slope, and the greater of both directions; and how much of a visible surface is left around it
  * when it is blurred.
  * reads   flat_inv  float[sources][height][pitch]  1/m
  *         matting   PyramidMatting
  * writes  slope     float[sources][height][pitch]  1/m per px; 0 where no neighbour is known; anything in holes
- *         broad     float[height][pitch]  share of eight pixels one sigma around that belong to the surface of source 0
- *                   or hide it; 1 in front of the first sub-image and behind the last
+ *         broad     float[height][pitch]  share of a blur's weight around a pixel that belongs to the surface of source
+ *                   0 or hides it; 1 in front of the first sub-image and behind the last
  * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_slope(__global float *restrict slope, __global float *restrict broad,
                             const __global float *restrict flat_inv, const __global PyramidMatting *restrict matting,
@@ -181,8 +217,11 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
             float16 rest = w * before.x + before.y;
             int16 is_own = (rest > 0.0f) & (rest <= 1.0f) & (w >= 0.0f);
             if (sum16(is_own ? (float16)(1.0f) : (float16)(0.0f)) == 0.0f) continue;
-            share = is_own ? breadth_of(flat_inv, w, x, y, size.width, size.height, size.pitch, matting->around[i],
-                                        1.0f / before.x) : share;
+            const int around = matting->around[i];
+            float16 near = ring_of(flat_inv, w, x, y, size, around, before.x);
+            float16 far = ring_of(flat_inv, w, x, y, size, 2 * around, before.x);
+            float16 all = PYRAMID_NEAR_RING * near + PYRAMID_FAR_RING * far + (1.0f - PYRAMID_NEAR_RING - PYRAMID_FAR_RING);
+            share = is_own ? all : share;
         }
         store_quad(broad + (size_t)row * size.pitch + x, share);
     }
@@ -204,7 +243,8 @@ static inline float16 matting_axis(float16 w)
  * A pixel that is 1 - t in the sub-image before and t past it takes its full weight here where its surface is broad, or
  * what is behind would show through, and only a share where it is thin: of what blurs to little both would add up to
  * more than there is. With b the breadth, t / (1 - (1 - t) b) is right for both. It enters earlier where it slopes, as
- * far as the blur opens a seam, and is broad; what crosses the whole ramp between two pixels is a silhouette. Slope and
+ * far as the blur opens a seam, and is broad, or it would vanish at the
+ * start of its own interval; what crosses the whole ramp between two pixels is a silhouette. Slope and
  * breadth are read where they count; 0 stands for no slope, and for broad. */
 static inline float16 matting_rise(float16 w, const __global float *slope, const __global float *broad,
                                    PyramidRamps ramps)
@@ -221,7 +261,7 @@ static inline float16 matting_rise(float16 w, const __global float *slope, const
         needed = needed > 1.0f ? one : needed;
         needed = needed < 1e-3f ? (float16)(1e-3f) : needed;
         float16 early = clamp01((rising - 1.0f) / needed + 1.0f);
-        if (broad && sum16(early * between) > 0.0f) early *= clamp01(2.0f * load_quad(broad) - 1.0f);
+        if (broad && sum16(early * between) > 0.0f) early *= clamp01(24.0f * load_quad(broad) - 23.0f);
         rising = rising < 1.0f ? early : rising;
     }
     if (broad && sum16(rest) > 0.0f) {

@@ -106,7 +106,7 @@ class Matting(NamedTuple):
     seam : ndarray, (N,)
         Part of the front ramp needed per slope of 1/m per px.
     around : ndarray, (N,)
-        Pixels at which to look for the rest of a surface: a sigma of the blur.
+        Pixels at which to look for the rest of a surface, and once more at twice as many: a sigma of the blur.
     """
 
     ramp: NDArray[np.float64]
@@ -231,8 +231,8 @@ class Pyramid:
 
         return Locality(
             max(2 * _MARGIN, 2**steps),
-            # Light spreads that far, and by how much goes by what is a sigma around.
-            math.ceil(3.5 * 2**steps + (blur_radius(steps) if self.matting == "seamless" else 0.0)) + 4,
+            # Light spreads that far, and by how much goes by what is two sigma around.
+            math.ceil(3.5 * 2**steps) + (2 * math.ceil(blur_radius(steps)) if self.matting == "seamless" else 0) + 4,
             reach_px,
             leak,
             # The farthest sub-image culls most.
