@@ -100,6 +100,16 @@ static inline float sum4(float4 v) { return (v.x + v.y) + (v.z + v.w); }
 /* How many of 16 pixels are holes. */
 static inline float count_holes(float16 w) { return sum16(w < 0.0f ? (float16)(1.0f) : (float16)(0.0f)); }
 
+static inline float greatest(float16 v)
+{
+    float8 a = v.lo > v.hi ? v.lo : v.hi;
+    float4 b = a.lo > a.hi ? a.lo : a.hi;
+    float2 c = b.lo > b.hi ? b.lo : b.hi;
+    return c.x > c.y ? c.x : c.y;
+}
+
+static inline float least(float16 v) { return -greatest(-v); }
+
 /* Four quads of a float16, by index. */
 static inline float4 part(float16 v, int q)
 {
@@ -173,21 +183,28 @@ static inline float16 shared_pair(float16 w, float16 a, float16 b, float scale)
     return (a >= 0.0f ? of_a : zero) + (b >= 0.0f ? of_b : zero);
 }
 
-/* The same of eight slots `far` pixels away from each of the 16 slots w from pixel (x, y) on, as a share. */
-static inline float16 ring_of(const __global float *inv_depth, float16 w, int x, int y, PyramidSize size, int far,
-                              float scale)
+/* Slots from (x, y) on; beyond the frame surfaces go on as they are at the slots w. */
+static inline float16 slots_around(const __global float *inv_depth, float16 w, int x, int y, PyramidSize size)
 {
-    const int near = far * 7 / 10 > 1 ? far * 7 / 10 : 1, last = size.height - 1, pitch = size.pitch;
-    const __global float *here = inv_depth + (size_t)y * pitch;
-    const __global float *up = inv_depth + (size_t)clamp_index(y - near, last) * pitch;
-    const __global float *down = inv_depth + (size_t)clamp_index(y + near, last) * pitch;
-    const __global float *top = inv_depth + (size_t)clamp_index(y - far, last) * pitch;
-    const __global float *bottom = inv_depth + (size_t)clamp_index(y + far, last) * pitch;
-    const int width = size.width;
-    float16 found = shared_pair(w, row_of_slots(here, x - far, width), row_of_slots(here, x + far, width), scale);
-    found += shared_pair(w, load_quad(top + x), load_quad(bottom + x), scale);
-    found += shared_pair(w, row_of_slots(up, x - near, width), row_of_slots(down, x + near, width), scale);
-    found += shared_pair(w, row_of_slots(up, x + near, width), row_of_slots(down, x - near, width), scale);
+    if (y < 0 || y >= size.height) return w;
+    const __global float *row = inv_depth + (size_t)y * size.pitch;
+    if (x >= 0 && x + 16 <= size.width) return load_quad(row + x);
+    float v[16];
+    *(float16_unaligned *)v = w;
+    for (int i = 0; i < 16; i++) v[i] = x + i >= 0 && x + i < size.width ? row[x + i] : v[i];
+    return *(const float16_unaligned *)v;
+}
+
+/* The same as shared_pair of eight slots `far` pixels away from each of the 16 slots w from pixel (x, y) on, a share. */
+static inline float16 ring_of(const __global float *inv, float16 w, int x, int y, PyramidSize size, int far, float scale)
+{
+    const int near = far * 7 / 10 > 1 ? far * 7 / 10 : 1;
+    float16 found = shared_pair(w, slots_around(inv, w, x - far, y, size), slots_around(inv, w, x + far, y, size), scale);
+    found += shared_pair(w, slots_around(inv, w, x, y - far, size), slots_around(inv, w, x, y + far, size), scale);
+    found += shared_pair(w, slots_around(inv, w, x - near, y - near, size),
+                         slots_around(inv, w, x + near, y + near, size), scale);
+    found += shared_pair(w, slots_around(inv, w, x + near, y - near, size),
+                         slots_around(inv, w, x - near, y + near, size), scale);
     return found * 0.125f;
 }
 
@@ -199,9 +216,11 @@ static inline float16 ring_of(const __global float *inv_depth, float16 w, int x,
  * writes  slope     float[sources][height][pitch]  1/m per px; 0 where no neighbour is known; anything in holes
  *         broad     float[height][pitch]  share of a blur's weight around a pixel that belongs to the surface of source
  *                   0 or hides it; 1 in front of the first sub-image and behind the last
+ *         span      float[sources][height][pitch / 16][2]  1/m; of each block the nearest slot, EMPTY if all are holes,
+ *                   and the farthest, or EMPTY minus it if there are holes
  * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_slope(__global float *restrict slope, __global float *restrict broad,
-                            const __global float *restrict flat_inv, const __global PyramidMatting *restrict matting,
+                            __global float *restrict span, const __global float *restrict flat_inv, const __global PyramidMatting *restrict matting,
                             PyramidSize size, int count)
 {
     const int row = get_global_id(1), y = row % size.height;
@@ -209,6 +228,11 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
         const __global float *inv = flat_inv + (size_t)row * size.pitch + x;
         const float16 w = load_quad(inv);
         store_quad(slope + (size_t)row * size.pitch + x, slope_of(inv, w, x, y, size.height, size.pitch, MAXFLOAT));
+        const float nearest = greatest(w), holes = least(w);
+        const float farthest = -greatest(w < 0.0f ? (float16)(-MAXFLOAT) : -w);
+        __global float *to = span + ((size_t)row * size.pitch + x) / 8;
+        to[0] = nearest;
+        to[1] = holes < 0.0f ? EMPTY - farthest : farthest;
         if (row >= size.height) continue;
         float16 share = (float16)(1.0f);
         for (int i = 0; i < count; i++) {
@@ -277,18 +301,52 @@ static inline float16 matting_fall(float16 w, float4 ramp) { return clamp01(matt
 
 /* --- culling (section 3.1) --- */
 
+/* Whether a block of slots holds nothing that a sub-image does not cull. */
+static inline int all_culled(const __global float *span, PyramidRamps ramps)
+{
+    const float farthest = span[1] < 0.0f ? EMPTY - span[1] : span[1];
+    return span[0] < 0.0f || farthest * ramps.ramp.x + ramps.ramp.y <= 0.0f;
+}
+
+/* 2: a block has no holes, and all that it shows is past a sub-image's front ramp; 1: and takes its full weight there. */
+static inline int all_past(const __global float *span, PyramidRamps ramps)
+{
+    const float rest = span[0] * ramps.before.x + ramps.before.y;
+    if (span[1] < 0.0f || span[0] * ramps.ramp.x + ramps.ramp.y < 1.0f || rest >= 1.0f) return 0;
+    return rest > 0.0f ? 2 : 1;
+}
+
+/* Whether a block has no holes, and all that it shows is too far behind a sub-image to be in it. */
+static inline int all_behind(const __global float *span, PyramidRamps ramps)
+{
+    return span[1] >= 0.0f && span[0] * ramps.ramp.z + ramps.ramp.w <= 0.0f;
+}
+
 /* The first source of 16 frame pixels that a sub-image does not cull.
  * Returns its front ramp, 0 where all sources are culled; there `from` is -1 and `inverse` EMPTY. `only` is the source
  * of all 16, -1 if all are culled, MIXED if they differ. */
 #define MIXED (-2)
 static inline float16 cull(float16 *from, int *only, float16 *inverse, const __global float *flat_inv,
-                           const __global float *slope, const __global float *broad, PyramidSize size,
-                           PyramidRamps ramps, int x, int y)
+                           const __global float *slope, const __global float *broad, const __global float *span,
+                           PyramidSize size, PyramidRamps ramps, int x, int y)
 {
     float16 rise = (float16)(0.0f), w = (float16)(EMPTY), source = (float16)(-1.0f);
     if (x >= 0 && x < size.pitch && y >= 0 && y < size.height) {
+#if !PYRAMID_PAPER
+        const size_t seen = (size_t)y * size.pitch + x;
+        const int own = all_past(span + seen / 8, ramps);
+        if (own) {
+            *only = 0;
+            *from = (float16)(0.0f);
+            *inverse = load_quad(flat_inv + seen);
+            return own == 1 ? (float16)(1.0f) : matting_rise(*inverse, slope + seen, broad + seen, ramps);
+        }
+#endif
         for (int s = 0; s < size.sources; s++) {
             const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
+#if !PYRAMID_PAPER
+            if (all_culled(span + at / 8, ramps)) continue;
+#endif
             float16 ws = load_quad(flat_inv + at);
 #if PYRAMID_PAPER
             float16 r = matting_rise(ws, 0, 0, ramps);
@@ -343,7 +401,7 @@ static inline void pull_quad(__global float *color, __global float *inv, float16
 
 /* pyramid_cull: culls a sub-image's foreground and pulls level 1 from what is left.
  * source  sections 3.1 and 3.2; Strengert et al. 2006
- * reads   flat, flat_inv, slope, broad  the stack of RGBZ images
+ * reads   flat, flat_inv, slope, broad, span  the stack of RGBZ images
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  fill      float[][4]  level 1 of all sub-images, up to the pitch
  *         fill_inv  float[]
@@ -351,7 +409,7 @@ static inline void pull_quad(__global float *color, __global float *inv, float16
 __kernel void pyramid_cull(__global float *restrict fill, __global float *restrict fill_inv,
                            const __global float *restrict flat, const __global float *restrict flat_inv,
                            const __global float *restrict slope, const __global float *restrict broad,
-                           const __global int4 *restrict table, const __global PyramidMatting *restrict matting,
+                           const __global float *restrict span, const __global int4 *restrict table, const __global PyramidMatting *restrict matting,
                            PyramidSize size)
 {
     const int i = get_global_id(1);
@@ -365,8 +423,8 @@ __kernel void pyramid_cull(__global float *restrict fill, __global float *restri
         const size_t to = (size_t)level.x + (size_t)row * level.w + 8 * b;
         float16 from[2], w[2];
         int only[2];
-        cull(&from[0], &only[0], &w[0], flat_inv, slope, broad, size, ramps, x, y);
-        cull(&from[1], &only[1], &w[1], flat_inv, slope, broad, size, ramps, x, y + 1);
+        cull(&from[0], &only[0], &w[0], flat_inv, slope, broad, span, size, ramps, x, y);
+        cull(&from[1], &only[1], &w[1], flat_inv, slope, broad, span, size, ramps, x, y + 1);
         if (only[0] == -1 && only[1] == -1) {
             store_quad(fill + to * 4, (float16)(0.0f));
             store_quad(fill + to * 4 + 16, (float16)(0.0f));
@@ -506,13 +564,21 @@ __kernel void pyramid_push(__global float *restrict fill, __global float *restri
 
 /* 16 pixels of a sub-image's level 0: culled, disoccluded and weighted. Returns 0 if nothing is there. */
 static inline int matted_block(float16 quad[4], const __global float *flat, const __global float *flat_inv,
-                               const __global float *slope, const __global float *broad,
+                               const __global float *slope, const __global float *broad, const __global float *span,
                                const __global float *fill, const __global float *fill_inv, int4 sub, int4 level,
                                PyramidSize size, PyramidRamps ramps, int x, int y)
 {
+#if !PYRAMID_PAPER
+    if (x >= 0 && x < size.pitch && y >= 0 && y < size.height &&
+        all_behind(span + ((size_t)y * size.pitch + x) / 8, ramps)) {
+#pragma unroll
+        for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
+        return 0;
+    }
+#endif
     float16 from, w;
     int only;
-    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, size, ramps, x, y);
+    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, span, size, ramps, x, y);
     /* What a visible surface with a share of its weight lets through of the next that is not culled. */
     float16 lets = from == 0.0f ? 1.0f - weight : (float16)(0.0f);
     weight *= matting_fall(w, ramps.ramp);
@@ -572,7 +638,7 @@ static inline float16 box_quad(float16 a, float16 b, float16 c)
 
 /* pyramid_matte: level 0 of a sub-image, matted, and reduced to level 1 in the same breath.
  * source  sections 3.3 and 3.4
- * reads   flat, flat_inv, slope, broad  the stack of RGBZ images
+ * reads   flat, flat_inv, slope, broad, span  the stack of RGBZ images
  *         fill, fill_inv  level 1 without holes
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  blur  float[][4]  level 1 of all sub-images that have steps
@@ -580,7 +646,8 @@ static inline float16 box_quad(float16 a, float16 b, float16 c)
  * local   lines  float[2][2 * segment + 32][4]  sums of two rows of level 0, from 16 px before the segment on */
 __kernel void pyramid_matte(__global float *restrict blur, const __global float *restrict flat,
                             const __global float *restrict flat_inv, const __global float *restrict slope,
-                            const __global float *restrict broad, const __global float *restrict fill,
+                            const __global float *restrict broad, const __global float *restrict span,
+                            const __global float *restrict fill,
                             const __global float *restrict fill_inv, const __global int4 *restrict table,
                             const __global PyramidMatting *restrict matting, PyramidSize size, int segment,
                             __local float *restrict lines)
@@ -604,9 +671,9 @@ __kernel void pyramid_matte(__global float *restrict blur, const __global float 
                 const int x = first + 16 * b;
                 if (x < 0 || x >= sub.z) continue;
                 float16 sum[4], quad[4];
-                matted_block(sum, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x - sub.x,
+                matted_block(sum, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps, x - sub.x,
                              clamp_index(2 * row - 1, sub.w - 1) - sub.x);
-                matted_block(quad, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x - sub.x,
+                matted_block(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps, x - sub.x,
                              clamp_index(2 * row, sub.w - 1) - sub.x);
 #pragma unroll
                 for (int q = 0; q < 4; q++) store_quad_local(line + (16 * b + 4 * q) * 4, sum[q] + quad[q]);
@@ -716,14 +783,15 @@ static inline void store_finished(__global float *out, float16 v, PyramidSize si
 /* pyramid_blend: expands level 1 of every sub-image and lays one over the other, nearest first (eqs. 14-15); crops the
  * guard band.
  * reads   blur  level 1 of sub-images with steps
- *         flat, flat_inv, slope, broad, fill, fill_inv  for the one in focus, which is not blurred
+ *         flat, flat_inv, slope, broad, span, fill, fill_inv  for the one in focus, which is not blurred
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  out  float[height - 2*guard][width - 2*guard][4]
  * range   2-D: (items per row, height - 2*guard), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_blend(__global float *restrict out, const __global float *restrict blur,
                             const __global float *restrict flat, const __global float *restrict flat_inv,
                             const __global float *restrict slope, const __global float *restrict broad,
-                            const __global float *restrict fill, const __global float *restrict fill_inv,
+                            const __global float *restrict span, const __global float *restrict fill,
+                            const __global float *restrict fill_inv,
                             const __global int4 *restrict table,
                             const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
@@ -735,7 +803,7 @@ __kernel void pyramid_blend(__global float *restrict out, const __global float *
             const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
             float16 quad[4];
             if (sub.y == 0) {
-                if (!matted_block(quad, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size,
+                if (!matted_block(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size,
                                   ramps_of(matting, i), x, y)) continue;
             } else {
                 const Between rows = between(level, y + sub.x);

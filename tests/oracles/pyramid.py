@@ -187,9 +187,11 @@ def breadth(blur: np.ndarray, around: int, interval: float) -> np.ndarray:
         near = max(1, far * 7 // 10)
         shares = []
         for dx, dy in ((far, 0), (0, far), (near, near), (-near, near)):
-            ends = [
-                blur[np.clip(y + way * dy, 0, height - 1), np.clip(x + way * dx, 0, width - 1)] for way in (-1, 1)
-            ]
+            ends = []
+            for row, column in ((y - dy, x - dx), (y + dy, x + dx)):
+                inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+                end = blur[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+                ends.append(np.where(inside, end, blur))  # beyond the frame surfaces go on
             for end, opposite in (ends, ends[::-1]):
                 plane = np.fmax(blur - opposite, 0.0)  # by so much it may be farther than the pixel
                 shares.append(np.nan_to_num(np.clip(1.0 - (end - blur - plane) / interval, 0.0, 1.0)))
