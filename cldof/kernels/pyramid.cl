@@ -28,10 +28,10 @@
 /* Below this coverage the result is 0 rather than a quotient of rounding errors. */
 #define PYRAMID_MIN_COVERAGE 1e-4f
 
-/* What slots one and two sigma around count for in a surface's breadth; the rest is the pixel's own. Beside a straight edge
- * that makes 0.64, 0.79, 0.87, 0.96 and 1 up to 0.7, 1, 1.4, 2 and past 2 sigma from it, where a Gaussian leaves 0.5 to
- * 0.76, 0.84, 0.92, 0.98. It must be 1 only where nothing is lost: what counts as broad there vanishes at once when focus
- * passes. */
+/* What slots one and two sigma around count for in a surface's breadth; the rest is the pixel's own. Beside a straight
+ * edge that makes 0.64, 0.79, 0.87, 0.96 and 1 up to 0.7, 1, 1.4, 2 and past 2 sigma from it; a Gaussian leaves 0.76,
+ * 0.84, 0.92, 0.98 at these distances. It must be 1 only where next to nothing is lost: a surface of breadth 1 leaves a
+ * sub-image at once when focus passes. */
 #define PYRAMID_NEAR_RING 0.6f
 #define PYRAMID_FAR_RING 0.35f
 
@@ -196,10 +196,12 @@ static inline float16 slots_around(const __global float *inv_depth, float16 w, i
 }
 
 /* The same as shared_pair of eight slots `far` pixels away from each of the 16 slots w from pixel (x, y) on, a share. */
-static inline float16 ring_of(const __global float *inv, float16 w, int x, int y, PyramidSize size, int far, float scale)
+static inline float16 ring_of(const __global float *inv, float16 w, int x, int y, PyramidSize size, int far,
+                              float scale)
 {
     const int near = far * 7 / 10 > 1 ? far * 7 / 10 : 1;
-    float16 found = shared_pair(w, slots_around(inv, w, x - far, y, size), slots_around(inv, w, x + far, y, size), scale);
+    float16 found =
+        shared_pair(w, slots_around(inv, w, x - far, y, size), slots_around(inv, w, x + far, y, size), scale);
     found += shared_pair(w, slots_around(inv, w, x, y - far, size), slots_around(inv, w, x, y + far, size), scale);
     found += shared_pair(w, slots_around(inv, w, x - near, y - near, size),
                          slots_around(inv, w, x + near, y + near, size), scale);
@@ -220,8 +222,8 @@ static inline float16 ring_of(const __global float *inv, float16 w, int x, int y
  *                   and the farthest, or EMPTY minus it if there are holes
  * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_slope(__global float *restrict slope, __global float *restrict broad,
-                            __global float *restrict span, const __global float *restrict flat_inv, const __global PyramidMatting *restrict matting,
-                            PyramidSize size, int count)
+                            __global float *restrict span, const __global float *restrict flat_inv,
+                            const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
     const int row = get_global_id(1), y = row % size.height;
     for (int x = 16 * get_global_id(0); x < size.pitch; x += 16 * get_global_size(0)) {
@@ -244,8 +246,8 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
             const int around = matting->around[i];
             float16 near = ring_of(flat_inv, w, x, y, size, around, before.x);
             float16 far = ring_of(flat_inv, w, x, y, size, 2 * around, before.x);
-            float16 all = PYRAMID_NEAR_RING * near + PYRAMID_FAR_RING * far + (1.0f - PYRAMID_NEAR_RING - PYRAMID_FAR_RING);
-            share = is_own ? all : share;
+            near = 1.0f - PYRAMID_NEAR_RING * (1.0f - near) - PYRAMID_FAR_RING * (1.0f - far);
+            share = is_own ? near : share;
         }
         store_quad(broad + (size_t)row * size.pitch + x, share);
     }
@@ -301,67 +303,76 @@ static inline float16 matting_fall(float16 w, float4 ramp) { return clamp01(matt
 
 /* --- culling (section 3.1) --- */
 
-/* Whether a block of slots holds nothing that a sub-image does not cull. */
-static inline int all_culled(const __global float *span, PyramidRamps ramps)
+/* Nearest and farthest slot of a block tell of most that a sub-image culls all of it, or none, or has no use for it. */
+static inline const __global float *span_of(const __global float *span, PyramidSize size, int s, int x, int y)
 {
-    const float farthest = span[1] < 0.0f ? EMPTY - span[1] : span[1];
-    return span[0] < 0.0f || farthest * ramps.ramp.x + ramps.ramp.y <= 0.0f;
+    return span + (((size_t)s * size.height + y) * size.pitch + x) / 8;
 }
 
-/* 2: a block has no holes, and all that it shows is past a sub-image's front ramp; 1: and takes its full weight there. */
-static inline int all_past(const __global float *span, PyramidRamps ramps)
+/* The first source of which a sub-image does not cull all 16 slots; size.sources if there is none, or no such pixel. */
+static inline int first_left(const __global float *span, PyramidSize size, PyramidRamps ramps, int x, int y)
 {
-    const float rest = span[0] * ramps.before.x + ramps.before.y;
-    if (span[1] < 0.0f || span[0] * ramps.ramp.x + ramps.ramp.y < 1.0f || rest >= 1.0f) return 0;
-    return rest > 0.0f ? 2 : 1;
+    if (x < 0 || x >= size.pitch || y < 0 || y >= size.height) return size.sources;
+#if PYRAMID_PAPER
+    return 0;
+#else
+    int s = 0;
+    for (; s < size.sources; s++) {
+        const __global float *of = span_of(span, size, s, x, y);
+        const float farthest = of[1] < 0.0f ? EMPTY - of[1] : of[1];
+        if (of[0] >= 0.0f && farthest * ramps.ramp.x + ramps.ramp.y > 0.0f) break;
+    }
+    return s;
+#endif
 }
 
-/* Whether a block has no holes, and all that it shows is too far behind a sub-image to be in it. */
-static inline int all_behind(const __global float *span, PyramidRamps ramps)
+/* Whether a block has no holes and is too far behind a sub-image to be in it. */
+static inline int is_behind(const __global float *of, PyramidRamps ramps)
 {
-    return span[1] >= 0.0f && span[0] * ramps.ramp.z + ramps.ramp.w <= 0.0f;
+    return of[1] >= 0.0f && of[0] * ramps.ramp.z + ramps.ramp.w <= 0.0f;
 }
 
-/* The first source of 16 frame pixels that a sub-image does not cull.
+/* Whether a block has no holes and is past a sub-image's front ramp. */
+static inline int is_past(const __global float *of, PyramidRamps ramps)
+{
+    return of[1] >= 0.0f && of[0] * ramps.ramp.x + ramps.ramp.y >= 1.0f;
+}
+
+/* The first source of 16 frame pixels, from source `first` on, that a sub-image does not cull.
  * Returns its front ramp, 0 where all sources are culled; there `from` is -1 and `inverse` EMPTY. `only` is the source
  * of all 16, -1 if all are culled, MIXED if they differ. */
 #define MIXED (-2)
 static inline float16 cull(float16 *from, int *only, float16 *inverse, const __global float *flat_inv,
                            const __global float *slope, const __global float *broad, const __global float *span,
-                           PyramidSize size, PyramidRamps ramps, int x, int y)
+                           PyramidSize size, PyramidRamps ramps, int x, int y, int first)
 {
     float16 rise = (float16)(0.0f), w = (float16)(EMPTY), source = (float16)(-1.0f);
-    if (x >= 0 && x < size.pitch && y >= 0 && y < size.height) {
-#if !PYRAMID_PAPER
-        const size_t seen = (size_t)y * size.pitch + x;
-        const int own = all_past(span + seen / 8, ramps);
-        if (own) {
-            *only = 0;
-            *from = (float16)(0.0f);
-            *inverse = load_quad(flat_inv + seen);
-            return own == 1 ? (float16)(1.0f) : matting_rise(*inverse, slope + seen, broad + seen, ramps);
-        }
-#endif
-        for (int s = 0; s < size.sources; s++) {
-            const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
-#if !PYRAMID_PAPER
-            if (all_culled(span + at / 8, ramps)) continue;
-#endif
-            float16 ws = load_quad(flat_inv + at);
+    float left = 16.0f;
+    *only = -1;
+    for (int s = first; s < size.sources; s++) {
+        const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
+        float16 ws = load_quad(flat_inv + at);
 #if PYRAMID_PAPER
-            float16 r = matting_rise(ws, 0, 0, ramps);
+        float16 r = matting_rise(ws, 0, 0, ramps);
 #else
-            float16 r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
-#endif
-            int16 take = (rise <= 0.0f) & (r > 0.0f);
-            w = take ? ws : w;
-            source = take ? (float16)((float)s) : source;
-            rise = take ? r : rise;
-            if (s + 1 < size.sources && count_holes(w) == 0.0f) break;
+        const __global float *of = span_of(span, size, s, x, y);
+        if (s == first && is_past(of, ramps) && (s > 0 || of[0] * ramps.before.x + ramps.before.y <= 0.0f)) {
+            *only = s;
+            *from = (float16)((float)s);
+            *inverse = ws;
+            return (float16)(1.0f);
         }
+        float16 r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
+#endif
+        int16 take = (rise <= 0.0f) & (r > 0.0f);
+        w = take ? ws : w;
+        source = take ? (float16)((float)s) : source;
+        rise = take ? r : rise;
+        const float before = left;
+        left = count_holes(w);
+        *only = left == 16.0f ? -1 : left == 0.0f && before == 16.0f ? s : MIXED;
+        if (left == 0.0f) break;
     }
-    const float holes = count_holes(w), front = sum16(source == 0.0f ? (float16)(1.0f) : (float16)(0.0f));
-    *only = front == 16.0f ? 0 : holes == 16.0f ? -1 : MIXED;
     *from = source;
     *inverse = w;
     return rise;
@@ -372,7 +383,7 @@ static inline float16 source_quad(const __global float *flat, PyramidSize size, 
 {
     float16 c = (float16)(0.0f);
     if (only == -1) return c;
-    if (only == 0) return load_quad(flat + ((size_t)y * size.pitch + x) * 4);
+    if (only >= 0) return load_quad(flat + (((size_t)only * size.height + y) * size.pitch + x) * 4);
     for (int s = 0; s < size.sources; s++) {
         float4 is = from == (float)s ? (float4)(1.0f) : (float4)(0.0f);
         if (sum4(is) == 0.0f) continue;
@@ -409,8 +420,8 @@ static inline void pull_quad(__global float *color, __global float *inv, float16
 __kernel void pyramid_cull(__global float *restrict fill, __global float *restrict fill_inv,
                            const __global float *restrict flat, const __global float *restrict flat_inv,
                            const __global float *restrict slope, const __global float *restrict broad,
-                           const __global float *restrict span, const __global int4 *restrict table, const __global PyramidMatting *restrict matting,
-                           PyramidSize size)
+                           const __global float *restrict span, const __global int4 *restrict table,
+                           const __global PyramidMatting *restrict matting, PyramidSize size)
 {
     const int i = get_global_id(1);
     const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
@@ -423,8 +434,9 @@ __kernel void pyramid_cull(__global float *restrict fill, __global float *restri
         const size_t to = (size_t)level.x + (size_t)row * level.w + 8 * b;
         float16 from[2], w[2];
         int only[2];
-        cull(&from[0], &only[0], &w[0], flat_inv, slope, broad, span, size, ramps, x, y);
-        cull(&from[1], &only[1], &w[1], flat_inv, slope, broad, span, size, ramps, x, y + 1);
+        for (int r = 0; r < 2; r++)
+            cull(&from[r], &only[r], &w[r], flat_inv, slope, broad, span, size, ramps, x, y + r,
+                 first_left(span, size, ramps, x, y + r));
         if (only[0] == -1 && only[1] == -1) {
             store_quad(fill + to * 4, (float16)(0.0f));
             store_quad(fill + to * 4 + 16, (float16)(0.0f));
@@ -568,9 +580,9 @@ static inline int matted_block(float16 quad[4], const __global float *flat, cons
                                const __global float *fill, const __global float *fill_inv, int4 sub, int4 level,
                                PyramidSize size, PyramidRamps ramps, int x, int y)
 {
+    const int first = first_left(span, size, ramps, x, y);
 #if !PYRAMID_PAPER
-    if (x >= 0 && x < size.pitch && y >= 0 && y < size.height &&
-        all_behind(span + ((size_t)y * size.pitch + x) / 8, ramps)) {
+    if (first < size.sources && is_behind(span_of(span, size, first, x, y), ramps)) {
 #pragma unroll
         for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
         return 0;
@@ -578,14 +590,14 @@ static inline int matted_block(float16 quad[4], const __global float *flat, cons
 #endif
     float16 from, w;
     int only;
-    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, span, size, ramps, x, y);
+    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, span, size, ramps, x, y, first);
     /* What a visible surface with a share of its weight lets through of the next that is not culled. */
     float16 lets = from == 0.0f ? 1.0f - weight : (float16)(0.0f);
     weight *= matting_fall(w, ramps.ramp);
     float16 filled = (float16)(0.0f); /* weight of holes */
     float holes = 0.0f;
     const Between rows = between(level, y + sub.x);
-    if (only != 0) {
+    if (only < 0) {
         float16 v = expand_depth(fill_inv, rows, (x + sub.x) / 2);
         filled = matting_rise(v, 0, 0, ramps) * matting_fall(v, ramps.ramp);
         filled = w < 0.0f ? filled : (float16)(0.0f);
@@ -671,10 +683,10 @@ __kernel void pyramid_matte(__global float *restrict blur, const __global float 
                 const int x = first + 16 * b;
                 if (x < 0 || x >= sub.z) continue;
                 float16 sum[4], quad[4];
-                matted_block(sum, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps, x - sub.x,
-                             clamp_index(2 * row - 1, sub.w - 1) - sub.x);
-                matted_block(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps, x - sub.x,
-                             clamp_index(2 * row, sub.w - 1) - sub.x);
+                matted_block(sum, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps,
+                             x - sub.x, clamp_index(2 * row - 1, sub.w - 1) - sub.x);
+                matted_block(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps,
+                             x - sub.x, clamp_index(2 * row, sub.w - 1) - sub.x);
 #pragma unroll
                 for (int q = 0; q < 4; q++) store_quad_local(line + (16 * b + 4 * q) * 4, sum[q] + quad[q]);
             }

@@ -179,7 +179,7 @@ def paper_matting(i: int, first: int, last: int, z: Callable[[int], float]) -> M
 
 
 def breadth(blur: np.ndarray, around: int, interval: float) -> np.ndarray:
-    """How much of the weight around each pixel belongs to its surface or hides it, (H, W): rings of one and two sigma."""
+    """Share of the weight around each pixel that belongs to its surface or hides it, (H, W): two rings."""
 
     def ring(far: int) -> np.ndarray:
         height, width = blur.shape
