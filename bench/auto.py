@@ -1,13 +1,13 @@
 """How ``method="auto"`` keeps an error and a time: the tables of docs/auto.md.
 
-    python -m bench auto                # some seven minutes on an idle 2-core machine, four with references on disk
+    python -m bench auto                # some ten minutes on an idle 2-core machine
     python -m bench auto --busy         # processor time in place of the clock, for a machine with other work
 
 Errors: 14 built-in scenes x 12 lenses (focus near, on the scene's subject and far; two apertures; disc and Gaussian) at
 256x256, each against its own accumulated reference. What is judged is never what was fitted: the measurements in
 bench/results/auto-tuning.json are of other lenses and sizes. There are two tables: with what `cldof tune` fits, and
-with models that for every scene are made anew from the other 13, as for a scene that nobody has measured. The device's
-times come from the run itself, always by a fit that leaves out the scene.
+with models that for every scene are made anew from the others, as for a scene that nobody has measured. The device's
+times come from the run itself, by a fit that leaves out the lens in the first table and the scene in the second.
 
 Times: frames of 512x512 of every scene, by a renderer of its own for each budget.
 """
@@ -43,6 +43,8 @@ from cldof.tune import (
     judged_db,
     make_renderers,
     reference_for,
+    sampled,
+    setting_renderer,
 )
 
 TUNING = Path(__file__).parent / "results" / "auto-tuning.json"
@@ -61,6 +63,7 @@ class Case(NamedTuple):
     """One scene through one lens, with what every setting makes of it."""
 
     scene: str
+    lens: int
     shape: str
     feature: NDArray[np.float64]
     db: NDArray[np.float64]
@@ -100,13 +103,16 @@ def measured_cases(device: Any, busy: bool, scenes: tuple[str, ...], size: int) 
                 scene = builtin_scenes()[name].make()
                 camera = scene.camera_for(size, size)
                 look = peeler.peel(scene, scene.camera_for(LOOK, LOOK), layers=2)
-                for lens in judged_lenses(scene, look):
+                for number, lens in enumerate(judged_lenses(scene, look)):
                     reference = reference_for(cache, peeler, scene, camera, lens, seed=1)
                     frame = capture(peeler, scene, camera, lens, look)
-                    ms = [frame_ms(renderer, frame, lens, 2, busy) for renderer in renderers]
-                    db = [judged_db(renderer.render(frame, lens).image, reference) for renderer in renderers]
+                    ms, db = [], []
+                    for renderer, setting in zip(renderers, LADDER, strict=True):
+                        taken = sampled(frame, setting)
+                        ms.append(frame_ms(renderer, taken, lens, 2, busy))
+                        db.append(judged_db(renderer.render(taken, lens).image, reference))
                     feature = features(renderers[0].stats(frame), lens, frame)
-                    yield Case(name, lens.aperture.shape, feature, np.array(db), np.array(ms))
+                    yield Case(name, number, lens.aperture.shape, feature, np.array(db), np.array(ms))
                 print(f"  {name}", flush=True)
     finally:
         for renderer in renderers:
@@ -117,7 +123,7 @@ def chosen(curves: Curves, budget: Budget, unit_ms: float, feature: NDArray[np.f
     """The setting that a renderer takes for its first frame."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BudgetWarning)
-        choice = Chooser(curves, budget, unit_ms).choose(feature)
+        choice = Chooser(curves, budget, unit_ms).choose(feature, has_finer=True)
     return curves.settings.index(choice.setting)
 
 
@@ -148,11 +154,12 @@ def judge_errors(cases: list[Case], unit_ms: float, left_out: bool) -> list[str]
     """The table for max_error; with ``left_out`` no scene is known to the models that it is judged by."""
     tuning = tuning_rows()
     picks: dict[int, list[int]] = {target: [0] * len(cases) for target in TARGETS_DB}
-    for scene in dict.fromkeys(case.scene for case in cases):
-        times = [TimeRow(case.feature, case.ms / unit_ms) for case in cases if case.scene != scene]
-        curves = fit_curves([row for row in tuning if not left_out or row.scene != scene], times, {})
+    parts = [case.scene if left_out else case.lens for case in cases]
+    for part in dict.fromkeys(parts):
+        times = [TimeRow(case.feature, case.ms / unit_ms) for case, of in zip(cases, parts, strict=True) if of != part]
+        curves = fit_curves([row for row in tuning if row.scene != part], times, {})
         for index, case in enumerate(cases):
-            if case.scene == scene:
+            if parts[index] == part:
                 for target in TARGETS_DB:
                     picks[target][index] = chosen(curves, Budget.of(f"{target}dB"), unit_ms, case.feature)
     lines = [
@@ -179,10 +186,7 @@ def judge_times(device: Any, busy: bool, unit_ms: float, scenes: tuple[str, ...]
             look = peeler.peel(scene, scene.camera_for(LOOK, LOOK), layers=2)
             lens = judged_lenses(scene, look)[(2, 9)[len(shots) % 2]]
             shots.append((capture(peeler, scene, camera, lens, look), lens))
-    quickest = [
-        min(_time(Renderer(one.method, device=device, **one.options), frame, lens, busy) for one in LADDER[:4])
-        for frame, lens in shots
-    ]
+    quickest = [min(_setting_ms(device, one, frame, lens, busy) for one in LADDER[:4]) for frame, lens in shots]
     for copies in BUDGETS_COPIES:
         budget = copies * unit_ms
         first, later, used = [], [], []
@@ -208,7 +212,7 @@ def judge_times(device: Any, busy: bool, unit_ms: float, scenes: tuple[str, ...]
 
 
 def _setting_ms(device: Any, setting: Setting, frame: LayeredFrame, lens: Lens, busy: bool) -> float:
-    return _time(Renderer(setting.method, device=device, **setting.options), frame, lens, busy)
+    return _time(setting_renderer(setting, device), sampled(frame, setting), lens, busy)
 
 
 def _time(renderer: Renderer, frame: LayeredFrame, lens: Lens, busy: bool) -> float:
@@ -229,7 +233,17 @@ def report(
         print(f"{renderer.device.info}, copy of 16 MB {unit:.3f} ms")
     cases = list(measured_cases(device, busy, scenes, size))
     if output:
-        rows = [{"scene": c.scene, "shape": c.shape, "db": c.db.tolist(), "ms": c.ms.tolist()} for c in cases]
+        rows = [
+            {
+                "scene": c.scene,
+                "lens": c.lens,
+                "shape": c.shape,
+                "feature": c.feature.tolist(),
+                "db": c.db.tolist(),
+                "ms": c.ms.tolist(),
+            }
+            for c in cases
+        ]
         Path(output).write_text(json.dumps({"settings": [str(one) for one in LADDER], "cases": rows}) + "\n")
     _, margin = fit_times([TimeRow(case.feature, case.ms / unit) for case in cases])
     most = ", ".join(f"{one} {math.exp(each):.1f}" for one, each in zip(LADDER, margin, strict=True))

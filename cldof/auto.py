@@ -19,6 +19,7 @@ import warnings
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from statistics import median
@@ -45,7 +46,7 @@ __all__ = [
     "load_curves",
 ]
 
-_FORMAT = 2
+_FORMAT = 3
 Vector = NDArray[np.float64]
 
 
@@ -57,14 +58,20 @@ class Setting:
     ----------
     method : str
     options : mapping
+    samples : int
+        Pixels of the frame for one of the image, along x and y: above 1 it takes :attr:`LayeredFrame.finer
+        <cldof.LayeredFrame.finer>`, and of each pixel what stands in its middle.
     """
 
     method: str
     options: Mapping[str, Any] = field(default_factory=dict)
+    samples: int = 1
 
     def __str__(self) -> str:
-        options = ", ".join(f"{name}={value}" for name, value in self.options.items())
-        return f"{self.method} ({options})" if options else self.method
+        options = [f"{name}={value}" for name, value in self.options.items()]
+        if self.samples > 1:
+            options.append(f"{self.samples}x{self.samples} samples")
+        return f"{self.method} ({', '.join(options)})" if options else self.method
 
 
 # Amounts below these are all the same: (name, amount). Features are logarithms of what is above them.
@@ -291,6 +298,7 @@ class Choice:
         return {
             "method": self.setting.method,
             "options": dict(self.setting.options),
+            "samples": self.setting.samples,
             "predicted_ms": self.predicted_ms,
             "predicted_db": self.predicted_db,
             "predicted_rms": self.predicted_rms,
@@ -346,6 +354,11 @@ class ErrorModel:
         variance = max(own - float(near @ self._inverse @ near), 0.0) + _NOISE
         return self._mean + near @ self._weights, math.sqrt(variance) * self._amplitude
 
+    def left_out(self) -> tuple[Vector, Vector]:
+        """What models of all other cases predict of each, (N, S): mean and standard deviation in dB (eq. 5.12)."""
+        own = np.diag(self._inverse)[:, None]
+        return self.db - self._weights / own, np.sqrt(1.0 / own) * self._amplitude
+
     def _scaled(self, feature: Vector) -> Vector:
         inside = np.clip(feature, self.low, self.high)[:, self._varies]
         scaled: Vector = (inside - self._centre) / self._spread
@@ -394,7 +407,9 @@ class Curves:
         data = {
             "format": _FORMAT,
             "features": list(FEATURES),
-            "settings": [{"method": one.method, "options": dict(one.options)} for one in self.settings],
+            "settings": [
+                {"method": one.method, "options": dict(one.options), "samples": one.samples} for one in self.settings
+            ],
             "measured_feature": _rounded(self.errors.feature),
             "measured_db": _rounded(self.errors.db),
             "log_time": _rounded(self.log_time),
@@ -416,7 +431,9 @@ class Curves:
             data = json.loads(text)
             if data["format"] != _FORMAT or tuple(data["features"]) != FEATURES:
                 raise InputError("The curves are of another version of cldof; run `cldof tune` again.")
-            settings = tuple(Setting(str(one["method"]), dict(one["options"])) for one in data["settings"])
+            settings = tuple(
+                Setting(str(one["method"]), dict(one["options"]), int(one["samples"])) for one in data["settings"]
+            )
             cases = len(data["measured_db"])
             if cases < 2:
                 raise InputError(f"The curves hold {cases} measured cases; two are needed.")
@@ -498,8 +515,12 @@ def curves_name(device: str, driver: str) -> str:
     return f"curves-{plain}-{key}.json"
 
 
-# How sure it is to keep an error is weighed against time: certainty is worth so many times the quickest setting's time.
-_WORTH = 80.0
+# How sure it is to keep an error is weighed against time: certainty is worth so many times the quickest setting's time,
+# the least of these by which so large a share of the measured cases is kept, each judged by models of all others. Their
+# lenses open up to twice as wide as scenes suggest; of ordinary ones 95 % and more are kept then.
+_WORTHS, _KEPT = tuple(20.0 * math.pow(2.0, step / 2.0) for step in range(11)), 0.915
+# Nothing that is less likely than this to keep an error is taken while something else is.
+_LIKELY = 0.5
 # Where no setting is likelier than this to keep an error, the one that comes nearest is taken.
 _HOPELESS = 0.1
 # What a time has to hold: so much of the margin for a setting that has not run, less of it where another of its method
@@ -530,6 +551,7 @@ class Chooser:
 
     def __init__(self, curves: Curves, budget: Budget, copy_ms: float) -> None:
         self.curves, self.budget, self.copy_ms = curves, budget, copy_ms
+        self._is_coarse = np.array([setting.samples == 1 for setting in curves.settings])
         self._current: int | None = None
         self._fading: tuple[int, int] | None = None  # from which setting, and for how many frames so far
         self._wished_for = 0
@@ -538,25 +560,34 @@ class Chooser:
         self._ratios: dict[int, deque[float]] = {}
         self._warned: int | None = None
 
-    def choose(self, feature: Vector) -> Choice:
+    def choose(self, feature: Vector, has_finer: bool = False) -> Choice:
         """The setting for a frame.
 
         Parameters
         ----------
         feature : ndarray
             Of :func:`features`.
+        has_finer : bool
+            The frame is to be had finer; else settings that take several samples a pixel are out of the question.
 
         Warns
         -----
         BudgetWarning
             No setting is expected to keep the budget: by how much. Once, until it changes.
         """
-        (errors, spread), times = self.curves.errors.predict(feature), self._times(feature)
+        (all_errors, spread), times = self.curves.errors.predict(feature), self._times(feature)
+        offered = self._is_coarse | has_finer
+        errors, times = np.where(offered, all_errors, -np.inf), np.where(offered, times, np.inf)
         before = self._current
+        if before is not None and not offered[before]:
+            before = self._current = self._fading = None
+        if self._fading is not None and not offered[self._fading[0]]:
+            self._fading = None
         if self._fading is not None and before is not None:  # one change at a time
             taken, reason = before, "kept from the frame before"
         else:
-            taken, reason = self._next(errors, spread, times)
+            worth = 0.0 if self.budget.min_db is None else _worth(self.curves, self.budget.min_db, has_finer)
+            taken, reason = self._next(errors, spread, times, worth)
         if before is not None and taken != before:
             fits = self.budget.max_ms is None or times[taken] + times[before] <= self.budget.max_ms
             self._fading = (before, 0) if fits else None
@@ -577,14 +608,14 @@ class Chooser:
             fades_from,
             share,
         )
-        self._warn(taken, choice)
+        self._warn(taken, choice, np.where(offered, -np.inf, all_errors))
         return choice
 
-    def _next(self, errors: Vector, spread: Vector, times: Vector) -> tuple[int, str]:
+    def _next(self, errors: Vector, spread: Vector, times: Vector, worth: float) -> tuple[int, str]:
         """The setting to take: another one when the one that runs fails, or when a gain has lasted."""
-        wished, reason = self._wish(errors, spread, times)
+        wished, reason = self._wish(errors, spread, times, worth)
         current = self._current
-        if current is None or wished == current or not self._keeps(current, wished, errors, spread, times):
+        if current is None or wished == current or not self._keeps(current, wished, errors, spread, times, worth):
             self._wished_for = 0
             return wished, reason
         if self.budget.max_ms is None:
@@ -611,13 +642,13 @@ class Chooser:
             corrections[index] = known.get(index, sum(family) / len(family) if family else 0.0)
         return np.asarray(self.curves.copies(feature) * self.copy_ms * np.exp(corrections))
 
-    def _wish(self, errors: Vector, spread: Vector, times: Vector) -> tuple[int, str]:
-        if self.budget.max_ms is not None:
+    def _wish(self, errors: Vector, spread: Vector, times: Vector, worth: float) -> tuple[int, str]:
+        if self.budget.min_db is None:
             return self._best_for_time(errors, times)
-        chance = self._chances(errors, spread)
+        chance = _chances(errors, spread, self.budget.min_db)
         if chance.max() < _HOPELESS:
-            return _nearly_best(np.arange(len(errors)), errors, times), "the least error there is"
-        best = int(_prices(times, chance).argmin())
+            return int(_picks(errors[None], times[None], chance[None], worth)[0]), "the least error there is"
+        best = int(_prices(times, chance, worth, min(_LIKELY, chance.max())).argmin())
         return best, f"{chance[best]:.0%} sure to keep the error, the most for the time"
 
     def _best_for_time(self, errors: Vector, times: Vector) -> tuple[int, str]:
@@ -625,13 +656,8 @@ class Chooser:
         fits = np.flatnonzero(times * self._headroom() <= self.budget.max_ms)
         if not fits.size:
             return int(times.argmin()), "the quickest there is"
-        return _nearly_best(fits, errors, times), f"the least error of {fits.size} settings that fit"
-
-    def _chances(self, errors: Vector, spread: Vector, lenience_db: float = 0.0) -> Vector:
-        """How likely each setting is to keep the error."""
-        assert self.budget.min_db is not None
-        short = (self.budget.min_db - lenience_db - errors) / spread
-        return np.array([0.5 * math.erfc(each / math.sqrt(2.0)) for each in short])
+        as_good = fits[errors[fits] >= errors[fits].max() - _AS_GOOD_DB]
+        return int(as_good[times[as_good].argmin()]), f"the least error of {fits.size} settings that fit"
 
     def _headroom(self) -> Vector:
         """Factors on expected times, for what the model does not know, (S,)."""
@@ -641,14 +667,17 @@ class Chooser:
         factors[list(self._ratios)] = _KNOWN
         return factors
 
-    def _keeps(self, index: int, wished: int, errors: Vector, spread: Vector, times: Vector) -> bool:
+    def _keeps(self, index: int, wished: int, errors: Vector, spread: Vector, times: Vector, worth: float) -> bool:
         """Whether a setting that runs may go on: the budget with less margin than a new one needs."""
         if self.budget.max_ms is not None:
             return bool(times[index] <= self.budget.max_ms)
+        assert self.budget.min_db is not None
         if times[wished] <= times[index]:
             return True
-        prices = _prices(times, self._chances(errors, spread))
-        lenient = _prices(times, self._chances(errors, spread, _LENIENCE_DB))
+        chances = _chances(errors, spread, self.budget.min_db)
+        prices = _prices(times, chances, worth)
+        lenient = _chances(errors, spread, self.budget.min_db - _LENIENCE_DB)
+        lenient = _prices(times, lenient, worth, min(_LIKELY, chances.max()))
         return bool(lenient[index] <= prices[wished])
 
     def _meets(self, index: int, errors: Vector, times: Vector) -> bool:
@@ -657,7 +686,7 @@ class Chooser:
         assert self.budget.min_db is not None
         return bool(errors[index] >= self.budget.min_db)
 
-    def _warn(self, index: int, choice: Choice) -> None:
+    def _warn(self, index: int, choice: Choice, finer_errors: Vector) -> None:
         if choice.meets_budget:
             self._warned = None
             return
@@ -675,16 +704,50 @@ class Chooser:
                 f"no setting is sure to reach {self.budget.min_db:.1f} dB; the nearest, {choice.setting}, is expected "
                 f"to miss it by {self.budget.min_db - choice.predicted_db:.1f} dB ({choice.predicted_db:.1f} dB)"
             )
+            best = int(finer_errors.argmax())
+            if finer_errors[best] > choice.predicted_db + _BETTER_DB:
+                what += (
+                    f". With a finer frame (LayeredFrame.with_finer) {self.curves.settings[best]} is expected to reach "
+                    f"{finer_errors[best]:.1f} dB"
+                )
         warnings.warn(f"{what}.", BudgetWarning, stacklevel=4)
 
 
-def _prices(times: Vector, chances: Vector) -> Vector:
-    """What settings cost, what they may miss included, in times of the quickest."""
-    prices: Vector = times / times.min() - _WORTH * chances
-    return prices
+def _chances(errors: Vector, spread: Vector, min_db: float) -> Vector:
+    """How likely each setting is to keep the error."""
+    chances: Vector = 0.5 * _erfc((min_db - errors) / (math.sqrt(2.0) * spread))
+    return chances
 
 
-def _nearly_best(among: NDArray[np.intp], errors: Vector, times: Vector) -> int:
-    """The cheapest of those whose error is hardly larger than the least."""
-    as_good = among[errors[among] >= errors[among].max() - _AS_GOOD_DB]
-    return int(as_good[times[as_good].argmin()])
+_erfc = np.vectorize(math.erfc, otypes=[np.float64])
+
+
+def _prices(times: Vector, chances: Vector, worth: float, least: float = 0.0) -> Vector:
+    """What settings cost, what they may miss included, in times of the quickest; settings along the last axis.
+
+    Those whose chance is not even ``least`` cannot be had.
+    """
+    prices: Vector = times / times.min(axis=-1, keepdims=True) - worth * chances
+    return np.where(chances >= least, prices, np.inf)
+
+
+def _picks(errors: Vector, times: Vector, chances: Vector, worth: float) -> NDArray[np.intp]:
+    """Settings for the error, (N,): the best of chance and time, or the cheapest of the nearest where none has any."""
+    nearest = np.where(errors >= errors.max(axis=1, keepdims=True) - _AS_GOOD_DB, times, np.inf).argmin(axis=1)
+    best = _prices(times, chances, worth).argmin(axis=1)
+    picks: NDArray[np.intp] = np.where(chances.max(axis=1) < _HOPELESS, nearest, best)
+    return picks
+
+
+@lru_cache(maxsize=16)
+def _worth(curves: Curves, min_db: float, has_finer: bool) -> float:
+    """What certainty to keep an error is worth, in times of the quickest setting: see :data:`_WORTHS`."""
+    offered = [index for index, setting in enumerate(curves.settings) if setting.samples == 1 or has_finer]
+    model = curves.errors
+    errors, spread = (each[:, offered] for each in model.left_out())
+    times = np.array([curves.copies(feature)[offered] for feature in model.feature])
+    kept, chances = model.db[:, offered] >= min_db, _chances(errors, spread, min_db)
+    for worth in _WORTHS:
+        if np.take_along_axis(kept, _picks(errors, times, chances, worth)[:, None], axis=1).mean() >= _KEPT:
+            break
+    return worth

@@ -30,7 +30,7 @@ from .camera import Camera
 from .errors import CldofError, DeviceError, FrameError, InputError, SceneError
 from .files import atomic_write, read_json
 from .focus import autofocus, focus_at, focus_on
-from .frame import LayeredFrame
+from .frame import FINER, LayeredFrame
 from .lens import Aperture, DiscAperture, GaussianAperture, ImageAperture, Lens, PolygonAperture
 from .lighting import Environment
 
@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     tune = commands.add_parser(
         "tune",
         help="measure what methods cost on a device, for --method auto",
-        description="Measure what settings cost on a device, two to three minutes, and keep it for --method auto.",
+        description="Measure what settings cost on a device, three to four minutes, and keep it for --method auto.",
     )
     tune.set_defaults(run=_tune)
     tune.add_argument("frames", nargs="*", metavar="FRAME", help="frames saved as .npz, in place of built-in scenes")
@@ -432,7 +432,7 @@ def _rendered(
     if _is_saved_frame(arguments.scene):
         shot = _load_shot(arguments, settings, factor, watch)
     else:
-        shot = _capture_shot(arguments, settings, factor, watch, renderer)
+        shot = _capture_shot(arguments, settings, factor, watch, renderer, stack)
     with watch.step("render"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         result = renderer.render(shot.frame, shot.lens)
@@ -648,19 +648,24 @@ def _load_shot(arguments: argparse.Namespace, settings: _Settings, factor: int, 
 
 
 def _capture_shot(
-    arguments: argparse.Namespace, settings: _Settings, factor: int, watch: _Stopwatch, renderer: Renderer
+    arguments: argparse.Namespace,
+    settings: _Settings,
+    factor: int,
+    watch: _Stopwatch,
+    renderer: Renderer,
+    stack: ExitStack,
 ) -> _Shot:
     from .capture.peel import DepthPeeler
 
     with watch.step("scene"):
         scene = _scene(arguments)
     camera = _camera(arguments, scene)
-    with DepthPeeler(camera.width, camera.height) as peeler:
-        preview, lens, remarks = _aimed(arguments, settings, peeler, scene, camera, watch)
-        if arguments.peels is None:
-            arguments.peels = _peels_for(renderer, preview, lens, remarks)
-        frame = _capture(arguments, peeler, scene, camera, preview, [lens], remarks, factor, watch)
-        return _Shot(frame, lens, camera, remarks, peeler.device)
+    peeler = stack.enter_context(DepthPeeler(camera.width, camera.height))
+    preview, lens, remarks = _aimed(arguments, settings, peeler, scene, camera, watch)
+    if arguments.peels is None:
+        arguments.peels = _peels_for(renderer, preview, lens, remarks)
+    frame = _capture(arguments, peeler, scene, camera, preview, [lens], remarks, factor, watch)
+    return _Shot(frame, lens, camera, remarks, peeler.device)
 
 
 def _peels_for(renderer: Renderer, preview: LayeredFrame, lens: Lens, remarks: list[str]) -> int:
@@ -695,12 +700,24 @@ def _capture(
         )
     peels = _DEFAULT_PEELS if arguments.peels is None else arguments.peels
     widest = max(lenses, key=lambda lens: lens.aperture_radius_m)
-    large = camera.supersampled(factor)
-    with watch.step("capture") as progress:
-        surface = preview.is_glossy_through(widest)
-        return peeler.peel(
-            scene, large, layers=peels, lens=widest, guard_px=factor * guard, surface=surface, progress=progress
-        )
+    surface = preview.is_glossy_through(widest)
+
+    def taken(step: str, times: int, lod_bias: float = 0.0) -> LayeredFrame:
+        with watch.step(step) as progress:
+            return peeler.peel(
+                scene, camera.supersampled(times), layers=peels, lens=widest, guard_px=times * guard, surface=surface,
+                progress=progress, lod_bias=lod_bias,
+            )  # fmt: skip
+
+    frame = taken("capture", factor)
+    if arguments.max_error is None or factor > 1:
+        return frame
+
+    def finer() -> LayeredFrame:
+        remarks.append(f"captured again {FINER} times larger: pixels of the image are too coarse for this error")
+        return taken("finer capture", FINER, math.log2(FINER))
+
+    return frame.with_finer(finer)
 
 
 def _aimed(
@@ -897,9 +914,11 @@ def _summarise(output: Path, facts: dict[str, Any], shot: _Shot, watch: _Stopwat
         print(f"  capture {shot.capture_device}")
     choice = facts["settings"].get("choice")
     if choice is not None:
-        options = ", ".join(f"{name}={value}" for name, value in choice["options"].items())
+        from .auto import Setting
+
+        taken = Setting(choice["method"], choice["options"], choice["samples"])
         print(
-            f"  auto    {choice['method']}{f' ({options})' if options else ''}, {choice['reason']}: expected "
+            f"  auto    {taken}, {choice['reason']}: expected "
             f"{choice['predicted_db']:.1f} dB (give or take {choice['uncertainty_db']:.1f}) and "
             f"{choice['predicted_ms']:.1f} ms a frame; its kernels took {kernels_ms:.1f} ms"
         )
@@ -951,22 +970,27 @@ class _Stopwatch:
 
     def __init__(self, quiet: bool) -> None:
         self.seconds: dict[str, float] = {}
+        self._open: list[dict[str, str]] = []
         self._quiet = quiet
         self._live = sys.stderr.isatty()
 
     @contextmanager
     def step(self, name: str) -> Iterator[Callable[[int, int], None]]:
-        """Time the block under ``name``; yields a callable for progress within it (done, of how many)."""
-        start = time.perf_counter()
+        """Time the block under ``name``; yields a callable for progress within it (done, of how many).
+
+        The time of steps within it is theirs alone.
+        """
+        start, others = time.perf_counter(), sum(self.seconds.values())
         state = {"text": f"{name} ..."}
+        self._open.append(state)
         over = threading.Event()
 
         def narrate() -> None:
             wait = _PATIENCE_S
             while not over.wait(wait):
-                print(
-                    f"\r\x1b[K{state['text']} {time.perf_counter() - start:.0f} s", end="", file=sys.stderr, flush=True
-                )
+                if self._open[-1] is state:
+                    line = f"\r\x1b[K{state['text']} {time.perf_counter() - start:.0f} s"
+                    print(line, end="", file=sys.stderr, flush=True)
                 wait = 0.5
             if wait != _PATIENCE_S:
                 print("\r\x1b[K", end="", file=sys.stderr, flush=True)
@@ -986,7 +1010,8 @@ class _Stopwatch:
             over.set()
             if narrator is not None:
                 narrator.join()
-            self.seconds[name] = elapsed = time.perf_counter() - start
+            self._open.pop()
+            self.seconds[name] = elapsed = time.perf_counter() - start - (sum(self.seconds.values()) - others)
             if elapsed > _PATIENCE_S and not self._quiet:
                 print(f"{name}: {elapsed:.1f} s", file=sys.stderr)
 

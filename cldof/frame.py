@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import math
 import os
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,10 @@ from .files import atomic_write, parse_json, read_arrays
 from .lens import Lens
 from .lighting import Environment, Lighting
 
-__all__ = ["LayeredFrame"]
+__all__ = ["FINER", "LayeredFrame"]
+
+FINER = 3
+"""A finer frame has so many pixels for one, along x and y: odd, so that one of them stands in the middle."""
 
 _FORMAT_VERSION = 1
 _SURFACE_CHANNELS = {"normal": 3, "albedo": 3, "specular": 3, "shininess": None}
@@ -102,6 +108,7 @@ class LayeredFrame:
                 _refuse(~np.isfinite(array), name, "NaN or infinite values")
                 self.surface[name] = array
         self.lighting = lighting
+        self._finer: LayeredFrame | Callable[[], LayeredFrame] | None = None
         self._check_values()
         for array in (self.color, self.depth, *self.surface.values()):
             array.setflags(write=False)
@@ -136,6 +143,62 @@ class LayeredFrame:
         if self.layer_count > 1:
             nearer = self.depth[1:] < self.depth[:-1] * np.float32(1.0 - _ORDER_TOLERANCE)
             _refuse(nearer, "depth", "layers out of order; each must be at least as deep as the one before it", first=1)
+
+    def with_finer(self, finer: LayeredFrame | Callable[[], LayeredFrame]) -> LayeredFrame:
+        """This frame, which knows of the same view captured :data:`FINER` (3) times larger, guard band included.
+
+        ``method="auto"`` renders from it where the pixels of the image are too coarse for the error that is asked for.
+
+        Parameters
+        ----------
+        finer : LayeredFrame or callable
+            A function is called once, when the finer frame is first needed, by the thread that renders.
+        """
+        known = copy.copy(self)
+        known._finer = finer
+        if isinstance(finer, LayeredFrame):
+            known._check_finer(finer)
+        return known
+
+    @property
+    def has_finer(self) -> bool:
+        """Whether the same view is to be had captured larger: :meth:`with_finer`."""
+        return self._finer is not None
+
+    @property
+    def finer(self) -> LayeredFrame:
+        """The same view captured :data:`FINER` (3) times larger.
+
+        Raises
+        ------
+        FrameError
+            There is none, or it is not of this frame's view.
+        """
+        if self._finer is None:
+            raise FrameError("This frame knows of no finer one; give it one by with_finer.")
+        if not isinstance(self._finer, LayeredFrame):
+            captured = self._finer()
+            self._check_finer(captured)
+            self._finer = captured
+        return self._finer
+
+    def _check_finer(self, finer: LayeredFrame) -> None:
+        if not isinstance(finer, LayeredFrame):
+            raise FrameError(f"A finer frame must be a LayeredFrame; got {type(finer).__name__}.")
+        wanted, camera = self.camera.supersampled(FINER), finer.camera
+        is_of_size = (camera.width, camera.height, finer.guard_px) == (
+            wanted.width,
+            wanted.height,
+            FINER * self.guard_px,
+        )
+        if not (
+            is_of_size and math.isclose(camera.yfov_deg, wanted.yfov_deg) and np.allclose(camera.pose, wanted.pose)
+        ):
+            found = f"{finer.camera.width}x{finer.camera.height} with a guard band of {finer.guard_px} px"
+            raise FrameError(
+                f"The finer frame is {found}; it must be {wanted.width}x{wanted.height} with {FINER * self.guard_px} "
+                f"px, and of the same view: capture it with camera.supersampled({FINER})."
+            )
 
     @property
     def layer_count(self) -> int:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .auto import Auto, Budget, Choice, Chooser, Setting, features, load_curves
 from .errors import CldofError, DeviceError, InputError
-from .frame import LayeredFrame
+from .frame import FINER, LayeredFrame
 from .host.buffers import BufferPool, HostInput
 from .host.device import Device
 from .host.launch import driver_errors
@@ -62,7 +62,7 @@ class Result:
     timings : list of PassTiming
         Per pass, in order; empty unless the renderer was made with ``profile=True``.
     wall_ms : float
-        From the call to the image on the host.
+        From the call to the image on the host; without the capture of a finer frame, if that was left for now.
     plan : FramePlan
         What was computed and what was left out; ``print(plan.explain())`` says it in words, ``plan.summary`` in plain
         numbers.
@@ -152,18 +152,21 @@ class _Automatic:
         self._lock = threading.Lock()  # results may be asked for by other threads than frames
         self.under_way = 0
 
-    def choose(self, stats: SceneStats, lens: Lens, frame: LayeredFrame) -> tuple[Choice, NDArray[np.float64]]:
+    def choose(
+        self, stats: SceneStats, lens: Lens, frame: LayeredFrame, has_finer: bool
+    ) -> tuple[Choice, NDArray[np.float64]]:
         with self._lock:
             if self._chooser is None:
                 info = self._device.info
                 curves = load_curves(info.name, info.driver_version)
                 self._chooser = Chooser(curves, self._budget, copy_baseline(self._device, runs=12).min_ms)
             feature = features(stats, lens, frame)
-            return self._chooser.choose(feature), feature
+            return self._chooser.choose(feature, has_finer), feature
 
     def method(self, setting: Setting) -> Method:
         if str(setting) not in self._methods:
-            self._methods[str(setting)] = make_method(setting.method, **setting.options)
+            made = make_method(setting.method, **setting.options)
+            self._methods[str(setting)] = _supersampled(made, setting.samples, antialias=False)
         return self._methods[str(setting)]
 
     def learn(self, choice: Choice, feature: NDArray[np.float64], ms: float) -> None:
@@ -259,6 +262,9 @@ class Renderer:
     supersample : int
         Frames come in captured this many times larger than the image, and the image is box-filtered down after the
         blur: edges in focus become smooth, at about the square of the cost.
+    antialias : bool
+        False keeps of every pixel the sample in its middle in place of the mean, as references without sub-pixel jitter
+        have it; for odd ``supersample``.
     planned : bool
         Leave out what the frame in front of the lens does not call for (:mod:`cldof.planner`). False computes
         everything, for comparison.
@@ -290,6 +296,7 @@ class Renderer:
         out_of_order: bool = False,
         frames_in_flight: int = 2,
         supersample: int = 1,
+        antialias: bool = True,
         planned: bool = True,
         max_change: float = MAX_CHANGE,
         statistics: str = "frame",
@@ -306,6 +313,11 @@ class Renderer:
             raise InputError(f"frames_in_flight is {frames_in_flight}; it must be at least 1.")
         if not (isinstance(supersample, int) and 1 <= supersample <= _MAX_SUPERSAMPLE):
             raise InputError(f"supersample is {supersample!r}; it must be a whole number, 1 to {_MAX_SUPERSAMPLE}.")
+        if not antialias and supersample % 2 == 0:
+            raise InputError(
+                f"supersample is {supersample} with antialias=False; use an odd number, which has a sample in the "
+                "middle of each pixel."
+            )
         if context is not None or queue is not None:
             if device is not None:
                 raise InputError("Give a device, or a context or queue of your own, not both.")
@@ -313,19 +325,16 @@ class Renderer:
         else:
             self.device = Device.open(device, profiling=profile, out_of_order=out_of_order)
         self._slots = frames_in_flight
-        # A method may take in all samples of a pixel at once; otherwise they are rendered like pixels and averaged.
-        self._supersample = supersample
+        self._supersample, self._antialias = supersample, antialias
         self._planned, self._max_change, self._statistics = planned, float(max_change), statistics
         self._latest: SceneStats | None = None
-        if supersample > 1 and hasattr(self.method, "supersampled"):
-            self.method = self.method.supersampled(supersample)
-        self._taken_in = int(getattr(self.method, "supersample", 1))
-        if self._taken_in > 1:
-            self._supersample = 1
+        if not isinstance(self.method, Auto):
+            self.method = _supersampled(self.method, supersample, antialias)
         self._lock = threading.Lock()
         self._rings: OrderedDict[Any, FrameRing] = OrderedDict()
         # Recent frames by identity; holding the frame keeps the identity from being used again.
         self._frames: OrderedDict[int, _DeviceFrame] = OrderedDict()
+        self._finer: OrderedDict[int, _DeviceFrame] = OrderedDict()
         self._automatic = _Automatic(self.method.budget, self.device) if isinstance(self.method, Auto) else None
         self._closed = False
         self._has_failed = False
@@ -366,39 +375,64 @@ class Renderer:
                 f"render takes a LayeredFrame and a Lens; got {type(frame).__name__}, {type(lens).__name__}."
             )
         shape = FrameShape.of(frame)
-        image = _output_array(out, (*self._image_size(shape), 4))
+        image = _output_array(out, (*_image_size(shape, self._supersample), 4))
         with self._turn():
             held = self._upload(frame, shape)
             if self._automatic is None:
                 assert not isinstance(self.method, Auto)
-                return self._start(held, lens, self.method, image, started)[0]
+                return self._start(held, lens, self.method, image, started, self._supersample, self._antialias)[0]
             assert held.stats is not None
             is_alone = self._automatic.under_way == 0
-            choice, feature = self._automatic.choose(self._known(held)[0], lens, frame)
+            fits = FINER**2 * frame.color.nbytes <= self.device.traits.max_alloc_bytes
+            has_finer = frame.has_finer and fits and self._supersample == 1
+            choice, feature = self._automatic.choose(self._known(held)[0], lens, frame, has_finer)
             faded = None
             if choice.fades_from is not None:
-                before = self._automatic.method(choice.fades_from)
-                faded, _ = self._start(held, lens, before, np.empty_like(image), started)
-            pending, is_new = self._start(held, lens, self._automatic.method(choice.setting), image, started)
+                faded, _ = self._start_setting(held, lens, choice.fades_from, np.empty_like(image), started)
+            pending, is_new = self._start_setting(held, lens, choice.setting, image, started)
             # The first frame of a kind builds what it needs; those that overlap with others wait for them.
             counts = is_alone and not is_new and faded is None
             pending.chosen(_Chosen(self._automatic, choice, feature, counts), faded)
             return pending
 
-    def _start(
-        self, held: _DeviceFrame, lens: Lens, method: Method, image: NDArray[np.float32], started: float
+    def _start_setting(
+        self, held: _DeviceFrame, lens: Lens, setting: Setting, image: NDArray[np.float32], started: float
     ) -> tuple[PendingResult, bool]:
-        """Enqueue a frame, and tell whether what it needs was made just now."""
+        """Enqueue a frame by a setting of ``method="auto"``, or the finer one of its view."""
+        assert self._automatic is not None
+        method = self._automatic.method(setting)
+        if setting.samples == 1:
+            return self._start(held, lens, method, image, started, self._supersample, self._antialias)
+        before = time.perf_counter()
+        frame = held.frame.finer
+        started += time.perf_counter() - before
+        held = self._upload(frame, FrameShape.of(frame), self._finer)
+        return self._start(held, lens, method, image, started, setting.samples, antialias=False)
+
+    def _start(
+        self,
+        held: _DeviceFrame,
+        lens: Lens,
+        method: Method,
+        image: NDArray[np.float32],
+        started: float,
+        factor: int,
+        antialias: bool,
+    ) -> tuple[PendingResult, bool]:
+        """Enqueue a frame of ``factor`` pixels for one, and tell whether what it needs was made just now."""
         planned = self._plan(held, lens, method)
         plan = planned.plan
-        ring, is_new = self._ring(held.shape, plan, method)
+        # A method may take in all samples of a pixel at once; otherwise they are rendered like pixels.
+        left = factor // int(getattr(method, "supersample", 1))
+        resolve = None if left == 1 else _Resolve(left, _image_size(held.shape, factor), antialias)
+        ring, is_new = self._ring(held.shape, plan, method, resolve)
         inputs, waits = self._inputs(held, ring.program, method, planned.gaps)
         submission = ring.submit(inputs, plan.params, waits)
         held.last_use = submission.event
         if not planned.is_kept:
             self._free(planned, submission.event)
-        output = "image" if self._supersample == 1 else "resolved"
-        download = self.device.pool.download(submission.batch.output(output), image, [submission.event])
+        output = submission.batch.output("image" if resolve is None else "resolved")
+        download = self.device.pool.download(output, image, [submission.event])
         submission.batch.hold(download)
         is_profiling = self.device.is_profiling
         return PendingResult(submission, download, image, planned, started, is_profiling, self._note_failure), is_new
@@ -433,6 +467,8 @@ class Renderer:
             finally:
                 self._rings.clear()
                 self._frames.clear()
+                self._finer.clear()
+                self._finer.clear()
                 self.device.close()  # with all of its memory
 
     def __enter__(self) -> Renderer:
@@ -451,7 +487,7 @@ class Renderer:
         """Statistics to plan by, and whether they are those of a frame before."""
         assert held.stats is not None
         if self._statistics == "last" and not held.stats.have_arrived():
-            for other in reversed(self._frames.values()):
+            for other in reversed([*self._finer.values(), *self._frames.values()]):
                 if other.shape == held.shape and other.stats is not None and other.stats.have_arrived():
                     self._latest = other.stats.wait()
                     break
@@ -514,27 +550,21 @@ class Renderer:
             self.device.finish()
         self._rings.clear()
         self._frames.clear()
+        self._finer.clear()
         self.device.pool.clear()
         self._has_failed = False
 
-    def _image_size(self, shape: FrameShape) -> tuple[int, int]:
-        factor = self._supersample * self._taken_in
-        height, width = shape.output_size
-        if height % factor or width % factor:
-            raise InputError(
-                f"The frame's camera is {width}x{height}, which supersample={factor} does not divide; capture it "
-                f"with a camera of {factor} times the image's size."
-            )
-        return height // factor, width // factor
-
-    def _upload(self, frame: LayeredFrame, shape: FrameShape) -> _DeviceFrame:
+    def _upload(
+        self, frame: LayeredFrame, shape: FrameShape, frames: OrderedDict[int, _DeviceFrame] | None = None
+    ) -> _DeviceFrame:
         """The frame's inputs, from the last calls or made now: colour, and inverse depth in padded rows."""
+        frames = self._frames if frames is None else frames
         key = id(frame)
-        held = self._frames.get(key)
+        held = frames.get(key)
         if held is not None:
-            self._frames.move_to_end(key)
+            frames.move_to_end(key)
             return held
-        preparation = self._free_preparation(shape)
+        preparation = self._free_preparation(shape, frames)
         if preparation is None:
             program = _preparation_program(shape, self.device.traits.is_cpu, self._planned)
             preparation = compile(program, self.device)
@@ -548,7 +578,7 @@ class Renderer:
         pool.free_input(depth, submission.event)
         stats = _ComingStats(frame, shape, preparation, pool, submission.event) if self._planned else None
         held = _DeviceFrame(frame, shape, {"color": color}, preparation, submission.event, stats)
-        self._frames[key] = held
+        frames[key] = held
         return held
 
     def _inputs(
@@ -574,11 +604,11 @@ class Renderer:
             waits += held.arrays[name].waits
         return buffers, waits
 
-    def _free_preparation(self, shape: FrameShape) -> Batch | None:
+    def _free_preparation(self, shape: FrameShape, frames: OrderedDict[int, _DeviceFrame]) -> Batch | None:
         """Make room for one more frame; hand over what prepared the one that goes, if it fits the next."""
         preparation = None
-        while len(self._frames) > self._slots:
-            _, old = self._frames.popitem(last=False)
+        while len(frames) > self._slots:
+            _, old = frames.popitem(last=False)
             for array in old.arrays.values():
                 self.device.pool.free_input(array, old.last_use)
             for planned in old.plans.values():
@@ -591,17 +621,19 @@ class Renderer:
                 old.preparation.close()
         return preparation
 
-    def _ring(self, shape: FrameShape, plan: FramePlan, method: Method) -> tuple[FrameRing, bool]:
+    def _ring(
+        self, shape: FrameShape, plan: FramePlan, method: Method, resolve: _Resolve | None
+    ) -> tuple[FrameRing, bool]:
         """Programs and buffers for frames of a kind, and whether they were made just now."""
-        key = (method, shape, plan.structure)
+        key = (method, shape, plan.structure, resolve)
         ring = self._rings.get(key)
         is_new = ring is None
         if ring is None:
             while len(self._rings) >= _KEPT_PROGRAMS:
                 self._rings.popitem(last=False)[1].close()
             program = planned_program(method, shape, plan, self.device.traits)
-            if self._supersample > 1:
-                program = _resolved(program, self._image_size(shape), self._supersample)
+            if resolve is not None:
+                program = _resolved(program, resolve)
             ring = FrameRing(program, self.device, self._slots)
             self._rings[key] = ring
             # What frames of other kinds left behind is of use again only if their sizes come back.
@@ -667,19 +699,45 @@ def _preparation_program(shape: FrameShape, is_cpu: bool, with_stats: bool) -> F
     return FrameProgram.of(buffers, [inverse])
 
 
-def _resolved(program: FrameProgram, size: tuple[int, int], factor: int) -> FrameProgram:
-    """Append the box filter to a method's passes."""
-    height, width = size
+class _Resolve(NamedTuple):
+    """How a supersampled image becomes one of this size, (height, width)."""
+
+    factor: int
+    size: tuple[int, int]
+    antialias: bool
+
+
+def _supersampled(method: Method, factor: int, antialias: bool) -> Method:
+    """The method for frames of so many pixels for one: told of it, if it can take them in."""
+    if factor > 1 and hasattr(method, "supersampled"):
+        told: Method = method.supersampled(factor, antialias)
+        return told
+    return method
+
+
+def _image_size(shape: FrameShape, factor: int) -> tuple[int, int]:
+    height, width = shape.output_size
+    if height % factor or width % factor:
+        raise InputError(
+            f"The frame's camera is {width}x{height}, which supersample={factor} does not divide; capture it "
+            f"with a camera of {factor} times the image's size."
+        )
+    return height // factor, width // factor
+
+
+def _resolved(program: FrameProgram, resolve: _Resolve) -> FrameProgram:
+    """Append to a method's passes the box filter, or what keeps the middle of every pixel."""
+    factor, (height, width), antialias = resolve
     buffers = [replace(b, role=Role.TRANSIENT) if b.name == "image" else b for b in program.buffers.values()]
     buffers.append(Buffer("resolved", height * width * 16, Role.OUTPUT))
-    box = Pass(
+    last = Pass(
         "frame",
-        "frame_box",
+        "frame_box" if antialias else "frame_middle",
         (write("resolved"), read("image"), np.int32(width), np.int32(height), np.int32(factor)),
         (-(-width // _BOX_RUN), height),
-        traffic_bytes=height * width * 16 * (factor**2 + 1),
+        traffic_bytes=height * width * 16 * ((factor**2 if antialias else 1) + 1),
     )
-    return FrameProgram.of(buffers, [*program.passes, box])
+    return FrameProgram.of(buffers, [*program.passes, last])
 
 
 def _output_array(out: NDArray[np.float32] | None, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ import math
 import re
 import shlex
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -86,7 +87,8 @@ def sequence(arguments: argparse.Namespace) -> None:
 
     with watch.step("device"):
         renderer = Renderer(arguments.method, device=arguments.device, supersample=factor, **settings.options)
-    with renderer:
+    with ExitStack() as stack:
+        stack.enter_context(renderer)
         if cli._is_saved_frame(arguments.scene):
             frame = LayeredFrame.load(arguments.scene)
             captured = frame.camera
@@ -99,13 +101,13 @@ def sequence(arguments: argparse.Namespace) -> None:
             with watch.step("scene"):
                 scene = cli._scene(arguments)
             camera = cli._camera(arguments, scene)
-            with DepthPeeler(camera.width, camera.height) as peeler:
-                whole = any("at" in key.words for key in keys)
-                preview, lens, remarks = cli._aimed(arguments, settings, peeler, scene, camera, watch, whole)
-                track = _track(keys, lens, arguments, lambda key: _focus(key, preview, camera, scene))
-                lenses = track.lenses(arguments.frames)
-                frame = cli._capture(arguments, peeler, scene, camera, preview, lenses, remarks, factor, watch)
-                capture_device = peeler.device
+            peeler = stack.enter_context(DepthPeeler(camera.width, camera.height))
+            whole = any("at" in key.words for key in keys)
+            preview, lens, remarks = cli._aimed(arguments, settings, peeler, scene, camera, watch, whole)
+            track = _track(keys, lens, arguments, lambda key: _focus(key, preview, camera, scene))
+            lenses = track.lenses(arguments.frames)
+            frame = cli._capture(arguments, peeler, scene, camera, preview, lenses, remarks, factor, watch)
+            capture_device = peeler.device
         times = []
         with watch.step("frames") as progress:
             for index, result in enumerate(render_track(renderer, frame, lenses)):

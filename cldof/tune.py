@@ -1,6 +1,6 @@
 """``cldof tune``: measure what settings cost on a device, and how far they err, for ``method="auto"``.
 
-How far a setting errs does not depend on the device, so as a rule only times are measured, in two to three minutes;
+How far a setting errs does not depend on the device, so as a rule only times are measured, in three to four minutes;
 errors are those that come with cldof. :func:`measure_errors` measures them anew, against accumulated references.
 
 Times are kept as ratios to a copy of 16 MB in the same run, so that they hold roughly for similar devices too.
@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ from .auto import FEATURES, Curves, ErrorModel, Setting, cache_folder, curves_na
 from .camera import Camera
 from .errors import InputError
 from .files import atomic_write
-from .frame import LayeredFrame
+from .frame import FINER, LayeredFrame
 from .host.device import Device
 from .host.profile import copy_baseline
 from .lens import Aperture, Lens
@@ -68,6 +69,9 @@ LADDER = (
     Setting("lightfield", {"views": 24}),
     Setting("lightfield", {"views": 64}),
     Setting("lightfield", {"views": 160}),
+    Setting("layered", samples=FINER),
+    Setting("multiview", {"rays": 64}, samples=FINER),
+    Setting("lightfield", {"views": 64}, samples=FINER),
 )
 """What ``method="auto"`` chooses from."""
 
@@ -77,12 +81,13 @@ _BEST_DB = 50.0
 _TIME_RIDGE, _TIME_PARTS = 3.0, 14
 # Features that times depend on; the others describe what is seen, not what is computed.
 _TIME_FEATURES = (
-    "one", "pixels", "peels", "blur", "blur_rms", "sharp", "near_coc", "far_coc", "light_tiles", "void"
+    "one", "pixels", "peels", "blur", "blur_rms", "sharp", "near_coc", "far_coc", "light_tiles", "void",
+    "gloss",
 )  # fmt: skip
 
 # Image sizes and lenses per scene: errors at small sizes, where references are quick, times also at a large one.
 _ERROR_SIZES, _LENSES = (160, 320), 12
-_TIME_SIZES = (192, 384, 640)
+_TIME_SIZES = (160, 320, 512)
 _PEELS = 4
 # A reference is drawn with more views until its own noise, which is known and taken off, lies below this.
 _NOISE_DB, _FEWEST_VIEWS, _MOST_VIEWS = 38.0, 48, 512
@@ -90,6 +95,8 @@ _GUARD_SHARE, _GUARD_STEP_PX = 0.10, 8
 # Scenes in which lens points see other highlights; users of such scenes capture surface buffers.
 _MIRRORING = ("floor", "mirrors")
 _RUNS = 3
+# Frames that take so long are timed fewer times.
+_LONG_MS = 200.0
 
 
 @dataclass(frozen=True)
@@ -170,14 +177,21 @@ def scene_lenses(scene: Scene, look: LayeredFrame, count: int, seed: int) -> lis
 def capture(
     peeler: DepthPeeler, scene: Scene, camera: Camera, lens: Lens, look: LayeredFrame, peels: int = _PEELS
 ) -> LayeredFrame:
-    """A frame with a guard band for the lens's largest blur, up to a tenth of the image."""
+    """A frame with a guard band for the lens's largest blur, up to a tenth of the image, and a finer one."""
     c1, c0 = lens.coc_coefficients(camera)
     largest = max(abs(c1 * inverse + c0) for inverse in look.inverse_depth_range)
     # Few different widths: OpenCL programs are compiled for each.
     wanted = min(largest, _GUARD_SHARE * max(camera.width, camera.height))
     guard = math.ceil(wanted / _GUARD_STEP_PX) * _GUARD_STEP_PX
     surface = scene.name in _MIRRORING
-    return peeler.peel(scene, camera, layers=peels, lens=lens, guard_px=guard, surface=surface)
+
+    def taken(factor: int = 1) -> LayeredFrame:
+        return peeler.peel(
+            scene, camera.supersampled(factor), layers=peels, lens=lens, guard_px=factor * guard, surface=surface,
+            lod_bias=math.log2(factor),
+        )  # fmt: skip
+
+    return taken().with_finer(lambda: taken(FINER))
 
 
 def reference_for(
@@ -220,8 +234,16 @@ def measure_errors(
     cases : iterable of (scene, frame, lens, reference)
     """
     for scene, frame, lens, reference in cases:
-        db = [judged_db(renderer.render(frame, lens).image, reference) for renderer in renderers]
+        db = [
+            judged_db(renderer.render(sampled(frame, setting), lens).image, reference)
+            for renderer, setting in zip(renderers, LADDER, strict=True)
+        ]
         yield ErrorRow(scene, features(renderers[0].stats(frame), lens, frame), np.array(db))
+
+
+def sampled(frame: LayeredFrame, setting: Setting) -> LayeredFrame:
+    """The frame, or the finer one, as the setting takes it."""
+    return frame if setting.samples == 1 else frame.finer
 
 
 def measure_times(
@@ -232,7 +254,10 @@ def measure_times(
     ``busy`` is for machines with other work: see :func:`frame_ms`.
     """
     for frame, lens in cases:
-        times = [frame_ms(renderer, frame, lens, busy=busy) for renderer in renderers]
+        times = [
+            frame_ms(renderer, sampled(frame, setting), lens, busy=busy)
+            for renderer, setting in zip(renderers, LADDER, strict=True)
+        ]
         feature = features(renderers[0].stats(frame), lens, frame)
         yield TimeRow(feature, np.array(times) / copy_ms)
 
@@ -244,9 +269,9 @@ def frame_ms(renderer: Renderer, frame: LayeredFrame, lens: Lens, runs: int = _R
     calling thread plus that of all others over the compute units.
     """
     renderer.render(frame, lens)
-    times = []
+    times: list[float] = []
     units = renderer.device.traits.compute_units
-    for _ in range(runs):
+    while len(times) < runs and sum(times) < _LONG_MS:
         process, thread, start = time.process_time(), time.thread_time(), time.perf_counter()
         renderer.render(frame, lens)
         wall, process = time.perf_counter() - start, time.process_time() - process
@@ -305,8 +330,12 @@ def _ridge(feature: Vector, target: Vector, strength: float) -> Vector:
 
 
 def frame_cases(frames: Sequence[LayeredFrame]) -> Iterator[tuple[LayeredFrame, Lens]]:
-    """Lenses for frames of somebody's own: focus at three depths, blur up to 1 and 4 % of the height."""
-    for frame in frames:
+    """Lenses for frames of somebody's own: focus at three depths, blur up to 1 and 4 % of the height.
+
+    Finer ones have every pixel several times: times are measured, not errors.
+    """
+    for given in frames:
+        frame = given.with_finer(partial(_enlarged, given))
         low, high = frame.inverse_depth_range
         for at in (0.1, 0.5, 0.9):
             focus = low + at * (high - low)
@@ -314,6 +343,11 @@ def frame_cases(frames: Sequence[LayeredFrame]) -> Iterator[tuple[LayeredFrame, 
             for share in (0.01, 0.04):
                 radius = share * frame.camera.height / (frame.camera.focal_px * spread) if spread else 0.01
                 yield frame, Lens(radius, 1.0 / focus if focus > 0.0 else math.inf)
+
+
+def _enlarged(frame: LayeredFrame) -> LayeredFrame:
+    color, depth = (array.repeat(FINER, axis=1).repeat(FINER, axis=2) for array in (frame.color, frame.depth))
+    return LayeredFrame(color, depth, frame.camera.supersampled(FINER), guard_px=FINER * frame.guard_px)
 
 
 def scene_cases(
@@ -329,12 +363,20 @@ def scene_cases(
             progress(number * lenses + index + 1, total)
 
 
+def setting_renderer(setting: Setting, device: int | str | None, **more: Any) -> Renderer:
+    """A renderer that renders by one setting; see :func:`sampled`."""
+    return Renderer(
+        setting.method, device=device, supersample=setting.samples, antialias=setting.samples == 1, **more,
+        **setting.options,
+    )  # fmt: skip
+
+
 def make_renderers(device: int | str | None) -> list[Renderer]:
     """One renderer for each setting of the ladder."""
     made: list[Renderer] = []
     try:
         for setting in LADDER:
-            made.append(Renderer(setting.method, device=device, frames_in_flight=1, **setting.options))
+            made.append(setting_renderer(setting, device, frames_in_flight=1))
     except BaseException:
         for renderer in made:
             renderer.close()

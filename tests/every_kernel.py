@@ -111,6 +111,7 @@ def _cases() -> Iterator[Case]:
             yield Case(method, frame=frame)
         yield Case(method, frame="void", renderer={"planned": False})
     yield Case("gather", frame="sharp", coc_px=20.0, renderer={"supersample": 2})
+    yield Case("gather", frame="sharp", coc_px=20.0, renderer={"supersample": 3, "antialias": False})
     for options in ({"cascade": False}, {"matting": "paper"}):
         for frame in ("opaque", "void"):
             yield Case("layered", options, frame)

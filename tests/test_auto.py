@@ -21,6 +21,7 @@ from cldof.auto import (
     Curves,
     ErrorModel,
     Setting,
+    _worth,
     cache_folder,
     curves_name,
     features,
@@ -31,7 +32,18 @@ from cldof.cli import main
 from cldof.host.device import Device, DeviceInfo
 from cldof.methods import make_method
 from cldof.renderer import frame_stats
-from cldof.tune import LADDER, ErrorRow, TimeRow, fit_curves, fit_times, frame_ms, save_rows, tune
+from cldof.tune import (
+    LADDER,
+    ErrorRow,
+    TimeRow,
+    fit_curves,
+    fit_times,
+    frame_cases,
+    frame_ms,
+    sampled,
+    save_rows,
+    tune,
+)
 from tests.frames import noise_frame, plane_frame
 from tests.opengl import require_opengl
 
@@ -49,24 +61,34 @@ def feature(amount: float = 0.0) -> np.ndarray:
 class Line:
     """In place of an :class:`ErrorModel`: each setting at a PSNR that falls by ``slope`` per unit of the amount."""
 
-    db: np.ndarray
+    at: np.ndarray
     spread: np.ndarray
     slope: float
     low = np.full(len(FEATURES), -100.0)
     high = np.full(len(FEATURES), 100.0)
+    # One case, out of reach: from such a chance is worth the most.
+    feature = np.zeros((1, len(FEATURES)))
+    db = np.zeros((1, len(SETTINGS)))
+
+    def left_out(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.db, np.ones_like(self.db)
 
     def predict(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self.db - self.slope * value[AMOUNT], self.spread
+        return self.at - self.slope * value[AMOUNT], self.spread
 
 
 def curves(
-    db: Sequence[float], copies: Sequence[float], slope: float = 0.0, spread: float | Sequence[float] = 0.1
+    db: Sequence[float],
+    copies: Sequence[float],
+    slope: float = 0.0,
+    spread: float | Sequence[float] = 0.1,
+    settings: tuple[Setting, ...] = SETTINGS,
 ) -> Curves:
     """Each setting at a PSNR, known to ``spread`` dB, and a time."""
-    log_time = np.zeros((len(FEATURES), len(SETTINGS)))
+    log_time = np.zeros((len(FEATURES), len(settings)))
     log_time[0] = np.log(copies)
-    line = Line(np.array(db, np.float64), np.broadcast_to(spread, len(SETTINGS)).astype(np.float64), slope)
-    return Curves(SETTINGS, line, log_time, np.full(len(SETTINGS), math.log(1.25)), {})  # type: ignore[arg-type]
+    line = Line(np.array(db, np.float64), np.broadcast_to(spread, len(settings)).astype(np.float64), slope)
+    return Curves(settings, line, log_time, np.full(len(settings), math.log(1.25)), {})  # type: ignore[arg-type]
 
 
 def first(given: Curves, budget: Budget, amount: float = 0.0, copy_ms: float = 1.0) -> Setting:
@@ -165,10 +187,67 @@ def test_the_cheapest_setting_that_is_sure_to_keep_an_error_is_taken() -> None:
 
 
 def test_some_chances_more_are_not_worth_any_time() -> None:
-    # 33 dB known to 2 dB are 30 dB with a chance of 0.933, 45 dB always: 80 * 0.067 = 5.3 times the quickest's time.
-    for slower, taken in ((7.0, SETTINGS[3]), (7.7, SETTINGS[2])):
+    # 33 dB known to 2 dB are 30 dB with a chance of 0.933, 45 dB always: 640 * 0.067 = 42.8 times the quickest's time.
+    for slower, taken in ((44.3, SETTINGS[3]), (45.2, SETTINGS[2])):
         given = curves([20, 20, 33, 45], [1, 4, 2, slower], spread=[0.1, 0.1, 2.0, 0.1])
         assert first(given, Budget.of("30dB")) == taken
+
+
+def test_a_chance_is_worth_what_keeps_the_cases_that_were_measured() -> None:
+    """Where the cheap setting nearly always keeps an error, the rest is not bought; where it seldom does, it is."""
+    rng = np.random.default_rng(4)
+    feature = np.zeros((200, len(FEATURES)))
+    feature[:, 0], feature[:, 2:6] = 1.0, rng.normal(0.0, 1.0, (200, 4))
+    db = np.array([33.0, 45.0]) + rng.normal(0.0, [2.0, 0.2], (200, 2))
+    log_time = np.zeros((len(FEATURES), 2))
+    log_time[0] = 0.0, math.log(40.0)
+    given = Curves(SETTINGS[:2], ErrorModel(feature, db), log_time, np.zeros(2), {})
+    worths = [_worth(given, target, False) for target in (28.0, 31.0, 60.0)]
+    assert worths[0] == 20.0 < worths[1] < 640.0 == worths[2]  # nothing reaches 60 dB
+    # 40 times the quickest's time is a lot for the last chances, and little where there is hardly one without.
+    assert first(given, Budget.of("28dB")) == SETTINGS[0] and first(given, Budget.of("34dB")) == SETTINGS[1]
+
+
+def test_cases_are_left_out_as_if_they_had_not_been_measured() -> None:
+    """Sundararajan & Keerthi's formula for one against a model made without the case; all else equal."""
+    errors, _, _ = rows(6, 30)
+    feature, db = np.array([row.feature for row in errors]), np.array([row.db for row in errors])
+    model = ErrorModel(feature, db)
+    inner = model._kernel(model._seen) + 0.05 * np.eye(30)
+    mean, spread = model.left_out()
+    for case in (0, 17):
+        rest = np.arange(30) != case
+        weights = np.linalg.solve(inner[np.ix_(rest, rest)], (db - db.mean(axis=0))[rest])
+        assert mean[case] == pytest.approx(db.mean(axis=0) + inner[case, rest] @ weights, rel=1e-9)
+        known = np.linalg.solve(inner[np.ix_(rest, rest)], inner[rest, case])
+        variance = inner[case, case] - inner[case, rest] @ known
+        assert spread[case] == pytest.approx(math.sqrt(variance) * model._amplitude, rel=1e-9)
+
+
+FINE = (*SETTINGS[:3], Setting("layered", samples=3))
+
+
+def test_finer_settings_are_taken_where_they_are_needed_and_to_be_had() -> None:
+    given = curves([25, 31, 33, 40], [1, 4, 2, 30], settings=FINE)
+    for target, taken in (("30dB", FINE[2]), ("36dB", FINE[3])):
+        assert Chooser(given, Budget.of(target), 1.0).choose(feature(), has_finer=True).setting == taken
+    with pytest.warns(BudgetWarning, match=r"With a finer frame .* layered \(3x3 samples\) is expected to reach 40\.0"):
+        choice = Chooser(given, Budget.of("36dB"), 1.0).choose(feature())
+    assert choice.setting == FINE[2]
+    for has_finer, taken in ((True, FINE[3]), (False, FINE[2])):
+        assert Chooser(given, Budget.of(max_ms=100), 1.0).choose(feature(), has_finer).setting == taken
+
+
+def test_an_image_passes_to_a_finer_setting_and_leaves_it_where_there_is_none() -> None:
+    given = curves([25, 31, 33, 60], [1, 4, 2, 30], slope=1.0, settings=FINE)
+    chooser = Chooser(given, Budget.of("30dB"), 1.0)
+    assert chooser.choose(feature(), has_finer=True).setting == FINE[2]
+    choices = [chooser.choose(feature(9.0), has_finer=True) for _ in range(10)]
+    assert all(choice.setting == FINE[3] for choice in choices)
+    assert [choice.fades_from for choice in choices] == [FINE[2]] * 8 + [None] * 2
+    with pytest.warns(BudgetWarning, match="finer frame"):
+        left = chooser.choose(feature(9.0))
+    assert left.setting == FINE[2] and left.fades_from is None
 
 
 def test_what_is_less_sure_has_to_promise_more() -> None:
@@ -412,6 +491,46 @@ def test_auto_renders_what_the_method_that_it_chose_does(device_info: DeviceInfo
             assert np.array_equal(result.image, renderer.render(frame, lens).image)
 
 
+def finer_frame(seed: int, count: list[int] | None = None) -> LayeredFrame:
+    """Noise in which nothing is wider than a third of a pixel; counts how often it is captured finer."""
+    finer = noise_frame(72, 60, seed=seed, guard_px=6)
+    middle = LayeredFrame(
+        finer.color[:, 1::3, 1::3], finer.depth[:, 1::3, 1::3], replace(finer.camera, width=24, height=20), guard_px=2
+    )
+
+    def captured() -> LayeredFrame:
+        if count is not None:
+            count.append(1)
+        return finer
+
+    return middle.with_finer(captured)
+
+
+@pytest.mark.parametrize("fine", [Setting("layered", samples=3), Setting("multiview", {"rays": 8}, samples=3)])
+def test_auto_renders_finer_frames(fine: Setting, device_info: DeviceInfo, monkeypatch: pytest.MonkeyPatch) -> None:
+    captured: list[int] = []
+    frame, lens = finer_frame(3, captured), Lens(0.03, 2.0, aperture="gaussian")
+    given = curves([25, 31, 33, 40], [1, 4, 2, 30], settings=(*SETTINGS[:3], fine))
+    monkeypatch.setattr("cldof.renderer.load_curves", lambda device, driver: given)
+    with Renderer("auto", device=device_info.index, max_error="32dB") as renderer:
+        assert renderer.render(frame, lens).choice.setting == SETTINGS[2]  # type: ignore[union-attr]
+        assert not captured
+    with Renderer("auto", device=device_info.index, max_error="36dB") as renderer:
+        results = [renderer.render(frame, lens) for _ in range(3)]
+        built = renderer.peak_device_bytes
+        for seed in range(4, 9):
+            assert renderer.render(finer_frame(seed), lens).image.shape == (20, 24, 4)
+        assert renderer.peak_device_bytes <= 2 * built  # as many frames as overlap are kept of either kind
+    assert len(captured) == 1 and results[0].choice is not None and results[0].choice.setting == fine
+    options = {"supersample": 3, "antialias": False, **fine.options}
+    with Renderer(fine.method, device=device_info.index, **options) as renderer:
+        assert np.array_equal(results[2].image, renderer.render(frame.finer, lens).image)
+    # Frames without a finer one are rendered as if there were no such settings.
+    with Renderer("auto", device=device_info.index, max_error="36dB") as renderer, pytest.warns(BudgetWarning):
+        plain = renderer.render(noise_frame(24, 20, seed=3), lens)
+    assert plain.choice is not None and plain.choice.setting == SETTINGS[2]
+
+
 def test_auto_keeps_to_one_setting_while_nothing_changes(device_info: DeviceInfo) -> None:
     frame = noise_frame(48, 48, seed=6)
     with warnings.catch_warnings(), Renderer("auto", device=device_info.index, max_error="25dB") as renderer:
@@ -438,7 +557,7 @@ def test_a_change_of_setting_is_a_blend_of_both(device_info: DeviceInfo, monkeyp
     given = curves([35, 45, 20, 20], [1, 4, 9, 9])
     monkeypatch.setattr("cldof.renderer.load_curves", lambda device, driver: given)
     amounts = iter([0.0, *[6.0] * 20])
-    monkeypatch.setattr(Line, "predict", lambda self, value: (self.db - next(amounts), self.spread))
+    monkeypatch.setattr(Line, "predict", lambda self, value: (self.at - next(amounts), self.spread))
     with Renderer("auto", device=device_info.index, max_error="30dB") as renderer:
         results = [renderer.render(frame, lens) for _ in range(10)]
     ends = []
@@ -460,6 +579,14 @@ def test_auto_refuses_what_makes_no_sense(options: dict[str, object]) -> None:
 
 
 # Tuning
+
+
+def test_finer_frames_tell_times_also_of_frames_that_have_none() -> None:
+    frame = noise_frame(20, 16, seed=2, guard_px=2)
+    shown = next(frame_cases([frame]))[0]
+    for at in ((0, 0), (1, 1), (2, 2)):
+        assert np.array_equal(shown.finer.color[:, at[0] :: 3, at[1] :: 3], frame.color)
+    assert sampled(shown, Setting("layered")) is shown and sampled(shown, FINE[3]) is shown.finer
 
 
 def test_tuning_on_frames_is_found_by_renderers(
@@ -539,6 +666,23 @@ def test_the_command_line_reports_the_choice(
     assert f"auto    {choice['method']}" in out and "expected" in out
     assert main([*base, "-o", "a.npy", "--max-ms", "1e-3"]) == 0
     assert "times too short" in capsys.readouterr().out
+
+
+def test_the_command_line_captures_again_where_pixels_are_too_coarse(
+    device_info: DeviceInfo, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    require_opengl()
+    given = curves([25, 31, 33, 40], [1, 4, 2, 30], settings=FINE)
+    monkeypatch.setattr("cldof.renderer.load_curves", lambda device, driver: given)
+    base = ["--size", "48x48", "--device", str(device_info.index), "--method", "auto", "--report", "r.json"]
+    for target, samples in (("30dB", 1), ("36dB", 3)):
+        assert main(["render", "floating", "-o", "a.png", *base, "--max-error", target]) == 0
+        report = json.loads(Path("r.json").read_text())
+        assert report["settings"]["choice"]["samples"] == samples
+        assert ("finer capture" in report["timings"]["steps_s"]) == (samples > 1)
+        assert ("captured again 3 times larger" in capsys.readouterr().out) == (samples > 1)
+    sequence = ["sequence", "floating", "-o", "#.png", "--frames", "2", *base, "--max-error", "36dB"]
+    assert main(sequence) == 0 and "captured again 3 times larger" in capsys.readouterr().out
 
 
 def test_the_command_line_captures_for_auto(

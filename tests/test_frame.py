@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from cldof import Camera, FrameError, LayeredFrame, OutputError
+from tests.frames import noise_frame
 
 CAMERA = Camera(5, 4, yfov_deg=40.0)
 
@@ -295,3 +296,25 @@ def test_missing_files_are_refused(tmp_path: Path) -> None:
         LayeredFrame.load(tmp_path / "none.npz")
     with pytest.raises(FrameError, match="no such file"):
         LayeredFrame.load(tmp_path)
+
+
+def test_a_finer_frame_is_of_the_same_view_and_captured_once() -> None:
+    frame, finer = noise_frame(10, 8, guard_px=1), noise_frame(30, 24, guard_px=3)
+    asked: list[int] = []
+
+    def captured() -> LayeredFrame:
+        asked.append(1)
+        return finer
+
+    known = frame.with_finer(captured)
+    assert known.has_finer and not asked and not frame.has_finer
+    assert known.finer is finer and known.finer is finer and len(asked) == 1
+    assert known.color is frame.color and frame.with_finer(finer).finer is finer
+    with pytest.raises(FrameError, match="no finer one"):
+        _ = frame.finer
+    with pytest.raises(FrameError, match="must be 30x24 with 3 px"):
+        frame.with_finer(frame)
+    with pytest.raises(FrameError, match="must be 30x24 with 3 px"):
+        _ = frame.with_finer(lambda: frame).finer
+    with pytest.raises(FrameError, match="got int"):
+        _ = frame.with_finer(lambda: 3).finer  # type: ignore[arg-type,return-value]

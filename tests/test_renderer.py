@@ -68,6 +68,26 @@ def test_sizes_that_do_not_come_back_are_given_back(device_info: DeviceInfo) -> 
             assert pool.allocated_bytes <= 2 * pool.in_use_bytes
 
 
+@pytest.mark.parametrize("method", ["layered", "multiview"])
+def test_supersampled_images_are_means_or_middles(method: str, device_info: DeviceInfo) -> None:
+    frame = noise_frame(60, 33, guard_px=6)
+    sharp = Lens(0.0, 2.0)
+    blocks = frame.pinhole_image().reshape(11, 3, 20, 3, 4)
+    for antialias, expected in ((True, blocks.mean(axis=(1, 3))), (False, blocks[:, 1, :, 1])):
+        with Renderer(method, device=device_info.index, supersample=3, antialias=antialias) as renderer:
+            assert renderer.render(frame, sharp).image == pytest.approx(expected, abs=2e-6)
+    with pytest.raises(InputError, match="use an odd number"):
+        Renderer(method, device=device_info.index, supersample=2, antialias=False)
+
+
+def test_the_middles_are_those_of_the_whole(device_info: DeviceInfo) -> None:
+    frame = noise_frame(60, 33, guard_px=6)
+    with Renderer("layered", device=device_info.index) as renderer:
+        whole = renderer.render(frame, lens_for(frame)).image
+    with Renderer("layered", device=device_info.index, supersample=3, antialias=False) as renderer:
+        assert np.array_equal(renderer.render(frame, lens_for(frame)).image, whole[1::3, 1::3])
+
+
 def test_out_is_filled_and_returned(device_info: DeviceInfo) -> None:
     frame = noise_frame(20, 10)
     out = np.full((10, 20, 4), np.nan, np.float32)

@@ -39,3 +39,19 @@ __kernel void frame_box(__global float *restrict out, const __global float *rest
         store_pixel(out + ((size_t)y * width + x) * 4, sum * scale);
     }
 }
+
+/* frame_middle: the pixel in the middle of each block, the resolve of a supersampled image with hard edges.
+ * reads   image  float[factor * height][factor * width][4]; factor is odd
+ * writes  out    float[height][width][4]
+ * range   2-D, one item per FRAME_BOX_RUN pixels of a row of out, any local size */
+__kernel void frame_middle(__global float *restrict out, const __global float *restrict image, int width, int height,
+                           int factor)
+{
+    const int x0 = FRAME_BOX_RUN * (int)get_global_id(0), y = get_global_id(1);
+    if (y >= height) return;
+    const int x1 = x0 + FRAME_BOX_RUN < width ? x0 + FRAME_BOX_RUN : width;
+    const size_t stride = (size_t)factor * width * 4;
+    const __global float *row = image + ((size_t)y * factor + factor / 2) * stride + (size_t)(factor / 2) * 4;
+    for (int x = x0; x < x1; x++)
+        store_pixel(out + ((size_t)y * width + x) * 4, load_pixel(row + (size_t)x * factor * 4));
+}

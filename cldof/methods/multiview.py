@@ -417,9 +417,11 @@ class Multiview:
             return self.refine_steps
         return _USUAL_HALVINGS if delta_px > _COARSE_PX else 0
 
-    def supersampled(self, factor: int) -> Multiview:
+    def supersampled(self, factor: int, antialias: bool = True) -> Multiview:
         """This method for frames with ``factor`` times the pixels; itself where it cannot take them in."""
-        return replace(self, supersample=factor) if self.traversal == "layers" else self
+        if self.traversal != "layers":
+            return self
+        return replace(self, supersample=factor, antialias=self.antialias and antialias)
 
     def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
         """Choose the layers from the range of depths, and what of them depends on the lens."""
