@@ -774,7 +774,9 @@ class _Planner:
             yield Decision("jitter", bool(says["jitter"]), reason)
         if "samples" in says:
             yield Decision(
-                "samples", True, f"{says['samples']} per blurred pixel, 1 where the blur is below half a pixel"
+                "samples",
+                True,
+                f"up to {says['samples']} per blurred pixel, more from 12 px of blur on, 1 below half a pixel",
             )
         if "eyes" in says:
             if says["eyes"]:

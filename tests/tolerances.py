@@ -36,7 +36,7 @@ TOLERANCES = {
     "pyramid_blur": Tolerance(1e-4, outliers=1e-3),
     "pyramid": Tolerance(1e-4, outliers=2e-3),
     # float32 may round a sample to the pixel beside it
-    "gather": Tolerance(1e-5, 1e-5, outliers=2e-2),
+    "gather": Tolerance(1e-5, 1e-5),
     # the narrowest lobes (0.01 rad) are only so well resolved by a float32 cosine
     "shading_split": Tolerance(2e-5, 1e-3, outliers=2e-3),
     "multiview_cone": Tolerance(2e-6),

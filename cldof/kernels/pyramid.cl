@@ -28,6 +28,13 @@
 /* Below this coverage the result is 0 rather than a quotient of rounding errors. */
 #define PYRAMID_MIN_COVERAGE 1e-4f
 
+/* What slots one and two sigma around count for in a surface's breadth; the rest is the pixel's own. Beside a straight
+ * edge that makes 0.64, 0.79, 0.87, 0.96 and 1 up to 0.7, 1, 1.4, 2 and past 2 sigma from it; a Gaussian leaves 0.76,
+ * 0.84, 0.92, 0.98 at these distances. It must be 1 only where next to nothing is lost: a surface of breadth 1 leaves a
+ * sub-image at once when focus passes. */
+#define PYRAMID_NEAR_RING 0.6f
+#define PYRAMID_FAR_RING 0.35f
+
 /* 1: matting functions as published, linear in z. 0: linear in the CoC, entered early only where a surface slopes. */
 #ifndef PYRAMID_PAPER
 #define PYRAMID_PAPER 0
@@ -93,6 +100,16 @@ static inline float sum4(float4 v) { return (v.x + v.y) + (v.z + v.w); }
 /* How many of 16 pixels are holes. */
 static inline float count_holes(float16 w) { return sum16(w < 0.0f ? (float16)(1.0f) : (float16)(0.0f)); }
 
+static inline float greatest(float16 v)
+{
+    float8 a = v.lo > v.hi ? v.lo : v.hi;
+    float4 b = a.lo > a.hi ? a.lo : a.hi;
+    float2 c = b.lo > b.hi ? b.lo : b.hi;
+    return c.x > c.y ? c.x : c.y;
+}
+
+static inline float least(float16 v) { return -greatest(-v); }
+
 /* Four quads of a float16, by index. */
 static inline float4 part(float16 v, int q)
 {
@@ -155,24 +172,69 @@ __kernel void pyramid_flatten(__global float *restrict flat, __global float *res
     }
 }
 
+/* How much of two opposite slots belongs to the surface of the slot w between them, or hides it: all of what is nearer
+ * or on a plane through the three, none of what is a whole interval (1 / scale) farther. That is what of a slot stands in
+ * the sub-image before while w enters its own, and it changes evenly with depth: nothing may switch while focus moves. */
+static inline float16 shared_pair(float16 w, float16 a, float16 b, float scale)
+{
+    const float16 zero = (float16)(0.0f);
+    float16 a_nearer = a > w ? a - w : zero, b_nearer = b > w ? b - w : zero;
+    float16 of_a = clamp01(1.0f - (w - a - b_nearer) * scale), of_b = clamp01(1.0f - (w - b - a_nearer) * scale);
+    return (a >= 0.0f ? of_a : zero) + (b >= 0.0f ? of_b : zero);
+}
+
+/* Slots from (x, y) on; beyond the frame surfaces go on as they are at the slots w. */
+static inline float16 slots_around(const __global float *inv_depth, float16 w, int x, int y, PyramidSize size)
+{
+    if (y < 0 || y >= size.height) return w;
+    const __global float *row = inv_depth + (size_t)y * size.pitch;
+    if (x >= 0 && x + 16 <= size.width) return load_quad(row + x);
+    float v[16];
+    *(float16_unaligned *)v = w;
+    for (int i = 0; i < 16; i++) v[i] = x + i >= 0 && x + i < size.width ? row[x + i] : v[i];
+    return *(const float16_unaligned *)v;
+}
+
+/* The same as shared_pair of eight slots `far` pixels away from each of the 16 slots w from pixel (x, y) on, a share. */
+static inline float16 ring_of(const __global float *inv, float16 w, int x, int y, PyramidSize size, int far,
+                              float scale)
+{
+    const int near = far * 7 / 10 > 1 ? far * 7 / 10 : 1;
+    float16 found =
+        shared_pair(w, slots_around(inv, w, x - far, y, size), slots_around(inv, w, x + far, y, size), scale);
+    found += shared_pair(w, slots_around(inv, w, x, y - far, size), slots_around(inv, w, x, y + far, size), scale);
+    found += shared_pair(w, slots_around(inv, w, x - near, y - near, size),
+                         slots_around(inv, w, x + near, y + near, size), scale);
+    found += shared_pair(w, slots_around(inv, w, x + near, y - near, size),
+                         slots_around(inv, w, x - near, y + near, size), scale);
+    return found * 0.125f;
+}
+
 /* pyramid_slope: change of inverse depth from one pixel to the next, the lesser of both sides, so that a silhouette
  * does not count as a slope, and the greater of both directions; and how much of a visible surface is left around it
  * when it is blurred.
  * reads   flat_inv  float[sources][height][pitch]  1/m
  *         matting   PyramidMatting
  * writes  slope     float[sources][height][pitch]  1/m per px; 0 where no neighbour is known; anything in holes
- *         broad     float[height][pitch]  share of eight pixels one sigma around that belong to the surface of source 0
- *                   or hide it; 1 in front of the first sub-image and behind the last
+ *         broad     float[height][pitch]  share of a blur's weight around a pixel that belongs to the surface of source
+ *                   0 or hides it; 1 in front of the first sub-image and behind the last
+ *         span      float[sources][height][pitch / 16][2]  1/m; of each block the nearest slot, EMPTY if all are holes,
+ *                   and the farthest, or EMPTY minus it if there are holes
  * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_slope(__global float *restrict slope, __global float *restrict broad,
-                            const __global float *restrict flat_inv, const __global PyramidMatting *restrict matting,
-                            PyramidSize size, int count)
+                            __global float *restrict span, const __global float *restrict flat_inv,
+                            const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
     const int row = get_global_id(1), y = row % size.height;
     for (int x = 16 * get_global_id(0); x < size.pitch; x += 16 * get_global_size(0)) {
         const __global float *inv = flat_inv + (size_t)row * size.pitch + x;
         const float16 w = load_quad(inv);
         store_quad(slope + (size_t)row * size.pitch + x, slope_of(inv, w, x, y, size.height, size.pitch, MAXFLOAT));
+        const float nearest = greatest(w), holes = least(w);
+        const float farthest = -greatest(w < 0.0f ? (float16)(-MAXFLOAT) : -w);
+        __global float *to = span + ((size_t)row * size.pitch + x) / 8;
+        to[0] = nearest;
+        to[1] = holes < 0.0f ? EMPTY - farthest : farthest;
         if (row >= size.height) continue;
         float16 share = (float16)(1.0f);
         for (int i = 0; i < count; i++) {
@@ -181,8 +243,11 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
             float16 rest = w * before.x + before.y;
             int16 is_own = (rest > 0.0f) & (rest <= 1.0f) & (w >= 0.0f);
             if (sum16(is_own ? (float16)(1.0f) : (float16)(0.0f)) == 0.0f) continue;
-            share = is_own ? breadth_of(flat_inv, w, x, y, size.width, size.height, size.pitch, matting->around[i],
-                                        1.0f / before.x) : share;
+            const int around = matting->around[i];
+            float16 near = ring_of(flat_inv, w, x, y, size, around, before.x);
+            float16 far = ring_of(flat_inv, w, x, y, size, 2 * around, before.x);
+            near = 1.0f - PYRAMID_NEAR_RING * (1.0f - near) - PYRAMID_FAR_RING * (1.0f - far);
+            share = is_own ? near : share;
         }
         store_quad(broad + (size_t)row * size.pitch + x, share);
     }
@@ -204,7 +269,8 @@ static inline float16 matting_axis(float16 w)
  * A pixel that is 1 - t in the sub-image before and t past it takes its full weight here where its surface is broad, or
  * what is behind would show through, and only a share where it is thin: of what blurs to little both would add up to
  * more than there is. With b the breadth, t / (1 - (1 - t) b) is right for both. It enters earlier where it slopes, as
- * far as the blur opens a seam, and is broad; what crosses the whole ramp between two pixels is a silhouette. Slope and
+ * far as the blur opens a seam, and is broad, or it would vanish at the
+ * start of its own interval; what crosses the whole ramp between two pixels is a silhouette. Slope and
  * breadth are read where they count; 0 stands for no slope, and for broad. */
 static inline float16 matting_rise(float16 w, const __global float *slope, const __global float *broad,
                                    PyramidRamps ramps)
@@ -221,7 +287,7 @@ static inline float16 matting_rise(float16 w, const __global float *slope, const
         needed = needed > 1.0f ? one : needed;
         needed = needed < 1e-3f ? (float16)(1e-3f) : needed;
         float16 early = clamp01((rising - 1.0f) / needed + 1.0f);
-        if (broad && sum16(early * between) > 0.0f) early *= clamp01(2.0f * load_quad(broad) - 1.0f);
+        if (broad && sum16(early * between) > 0.0f) early *= clamp01(24.0f * load_quad(broad) - 23.0f);
         rising = rising < 1.0f ? early : rising;
     }
     if (broad && sum16(rest) > 0.0f) {
@@ -237,33 +303,76 @@ static inline float16 matting_fall(float16 w, float4 ramp) { return clamp01(matt
 
 /* --- culling (section 3.1) --- */
 
-/* The first source of 16 frame pixels that a sub-image does not cull.
+/* Nearest and farthest slot of a block tell of most that a sub-image culls all of it, or none, or has no use for it. */
+static inline const __global float *span_of(const __global float *span, PyramidSize size, int s, int x, int y)
+{
+    return span + (((size_t)s * size.height + y) * size.pitch + x) / 8;
+}
+
+/* The first source of which a sub-image does not cull all 16 slots; size.sources if there is none, or no such pixel. */
+static inline int first_left(const __global float *span, PyramidSize size, PyramidRamps ramps, int x, int y)
+{
+    if (x < 0 || x >= size.pitch || y < 0 || y >= size.height) return size.sources;
+#if PYRAMID_PAPER
+    return 0;
+#else
+    int s = 0;
+    for (; s < size.sources; s++) {
+        const __global float *of = span_of(span, size, s, x, y);
+        const float farthest = of[1] < 0.0f ? EMPTY - of[1] : of[1];
+        if (of[0] >= 0.0f && farthest * ramps.ramp.x + ramps.ramp.y > 0.0f) break;
+    }
+    return s;
+#endif
+}
+
+/* Whether a block has no holes and is too far behind a sub-image to be in it. */
+static inline int is_behind(const __global float *of, PyramidRamps ramps)
+{
+    return of[1] >= 0.0f && of[0] * ramps.ramp.z + ramps.ramp.w <= 0.0f;
+}
+
+/* Whether a block has no holes and is past a sub-image's front ramp. */
+static inline int is_past(const __global float *of, PyramidRamps ramps)
+{
+    return of[1] >= 0.0f && of[0] * ramps.ramp.x + ramps.ramp.y >= 1.0f;
+}
+
+/* The first source of 16 frame pixels, from source `first` on, that a sub-image does not cull.
  * Returns its front ramp, 0 where all sources are culled; there `from` is -1 and `inverse` EMPTY. `only` is the source
  * of all 16, -1 if all are culled, MIXED if they differ. */
 #define MIXED (-2)
 static inline float16 cull(float16 *from, int *only, float16 *inverse, const __global float *flat_inv,
-                           const __global float *slope, const __global float *broad, PyramidSize size,
-                           PyramidRamps ramps, int x, int y)
+                           const __global float *slope, const __global float *broad, const __global float *span,
+                           PyramidSize size, PyramidRamps ramps, int x, int y, int first)
 {
     float16 rise = (float16)(0.0f), w = (float16)(EMPTY), source = (float16)(-1.0f);
-    if (x >= 0 && x < size.pitch && y >= 0 && y < size.height) {
-        for (int s = 0; s < size.sources; s++) {
-            const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
-            float16 ws = load_quad(flat_inv + at);
+    float left = 16.0f;
+    *only = -1;
+    for (int s = first; s < size.sources; s++) {
+        const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
+        float16 ws = load_quad(flat_inv + at);
 #if PYRAMID_PAPER
-            float16 r = matting_rise(ws, 0, 0, ramps);
+        float16 r = matting_rise(ws, 0, 0, ramps);
 #else
-            float16 r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
-#endif
-            int16 take = (rise <= 0.0f) & (r > 0.0f);
-            w = take ? ws : w;
-            source = take ? (float16)((float)s) : source;
-            rise = take ? r : rise;
-            if (s + 1 < size.sources && count_holes(w) == 0.0f) break;
+        const __global float *of = span_of(span, size, s, x, y);
+        if (s == first && is_past(of, ramps) && (s > 0 || of[0] * ramps.before.x + ramps.before.y <= 0.0f)) {
+            *only = s;
+            *from = (float16)((float)s);
+            *inverse = ws;
+            return (float16)(1.0f);
         }
+        float16 r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
+#endif
+        int16 take = (rise <= 0.0f) & (r > 0.0f);
+        w = take ? ws : w;
+        source = take ? (float16)((float)s) : source;
+        rise = take ? r : rise;
+        const float before = left;
+        left = count_holes(w);
+        *only = left == 16.0f ? -1 : left == 0.0f && before == 16.0f ? s : MIXED;
+        if (left == 0.0f) break;
     }
-    const float holes = count_holes(w), front = sum16(source == 0.0f ? (float16)(1.0f) : (float16)(0.0f));
-    *only = front == 16.0f ? 0 : holes == 16.0f ? -1 : MIXED;
     *from = source;
     *inverse = w;
     return rise;
@@ -274,7 +383,7 @@ static inline float16 source_quad(const __global float *flat, PyramidSize size, 
 {
     float16 c = (float16)(0.0f);
     if (only == -1) return c;
-    if (only == 0) return load_quad(flat + ((size_t)y * size.pitch + x) * 4);
+    if (only >= 0) return load_quad(flat + (((size_t)only * size.height + y) * size.pitch + x) * 4);
     for (int s = 0; s < size.sources; s++) {
         float4 is = from == (float)s ? (float4)(1.0f) : (float4)(0.0f);
         if (sum4(is) == 0.0f) continue;
@@ -303,7 +412,7 @@ static inline void pull_quad(__global float *color, __global float *inv, float16
 
 /* pyramid_cull: culls a sub-image's foreground and pulls level 1 from what is left.
  * source  sections 3.1 and 3.2; Strengert et al. 2006
- * reads   flat, flat_inv, slope, broad  the stack of RGBZ images
+ * reads   flat, flat_inv, slope, broad, span  the stack of RGBZ images
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  fill      float[][4]  level 1 of all sub-images, up to the pitch
  *         fill_inv  float[]
@@ -311,8 +420,8 @@ static inline void pull_quad(__global float *color, __global float *inv, float16
 __kernel void pyramid_cull(__global float *restrict fill, __global float *restrict fill_inv,
                            const __global float *restrict flat, const __global float *restrict flat_inv,
                            const __global float *restrict slope, const __global float *restrict broad,
-                           const __global int4 *restrict table, const __global PyramidMatting *restrict matting,
-                           PyramidSize size)
+                           const __global float *restrict span, const __global int4 *restrict table,
+                           const __global PyramidMatting *restrict matting, PyramidSize size)
 {
     const int i = get_global_id(1);
     const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
@@ -325,8 +434,9 @@ __kernel void pyramid_cull(__global float *restrict fill, __global float *restri
         const size_t to = (size_t)level.x + (size_t)row * level.w + 8 * b;
         float16 from[2], w[2];
         int only[2];
-        cull(&from[0], &only[0], &w[0], flat_inv, slope, broad, size, ramps, x, y);
-        cull(&from[1], &only[1], &w[1], flat_inv, slope, broad, size, ramps, x, y + 1);
+        for (int r = 0; r < 2; r++)
+            cull(&from[r], &only[r], &w[r], flat_inv, slope, broad, span, size, ramps, x, y + r,
+                 first_left(span, size, ramps, x, y + r));
         if (only[0] == -1 && only[1] == -1) {
             store_quad(fill + to * 4, (float16)(0.0f));
             store_quad(fill + to * 4 + 16, (float16)(0.0f));
@@ -466,20 +576,28 @@ __kernel void pyramid_push(__global float *restrict fill, __global float *restri
 
 /* 16 pixels of a sub-image's level 0: culled, disoccluded and weighted. Returns 0 if nothing is there. */
 static inline int matted_block(float16 quad[4], const __global float *flat, const __global float *flat_inv,
-                               const __global float *slope, const __global float *broad,
+                               const __global float *slope, const __global float *broad, const __global float *span,
                                const __global float *fill, const __global float *fill_inv, int4 sub, int4 level,
                                PyramidSize size, PyramidRamps ramps, int x, int y)
 {
+    const int first = first_left(span, size, ramps, x, y);
+#if !PYRAMID_PAPER
+    if (first < size.sources && is_behind(span_of(span, size, first, x, y), ramps)) {
+#pragma unroll
+        for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
+        return 0;
+    }
+#endif
     float16 from, w;
     int only;
-    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, size, ramps, x, y);
+    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, span, size, ramps, x, y, first);
     /* What a visible surface with a share of its weight lets through of the next that is not culled. */
     float16 lets = from == 0.0f ? 1.0f - weight : (float16)(0.0f);
     weight *= matting_fall(w, ramps.ramp);
     float16 filled = (float16)(0.0f); /* weight of holes */
     float holes = 0.0f;
     const Between rows = between(level, y + sub.x);
-    if (only != 0) {
+    if (only < 0) {
         float16 v = expand_depth(fill_inv, rows, (x + sub.x) / 2);
         filled = matting_rise(v, 0, 0, ramps) * matting_fall(v, ramps.ramp);
         filled = w < 0.0f ? filled : (float16)(0.0f);
@@ -532,7 +650,7 @@ static inline float16 box_quad(float16 a, float16 b, float16 c)
 
 /* pyramid_matte: level 0 of a sub-image, matted, and reduced to level 1 in the same breath.
  * source  sections 3.3 and 3.4
- * reads   flat, flat_inv, slope, broad  the stack of RGBZ images
+ * reads   flat, flat_inv, slope, broad, span  the stack of RGBZ images
  *         fill, fill_inv  level 1 without holes
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  blur  float[][4]  level 1 of all sub-images that have steps
@@ -540,7 +658,8 @@ static inline float16 box_quad(float16 a, float16 b, float16 c)
  * local   lines  float[2][2 * segment + 32][4]  sums of two rows of level 0, from 16 px before the segment on */
 __kernel void pyramid_matte(__global float *restrict blur, const __global float *restrict flat,
                             const __global float *restrict flat_inv, const __global float *restrict slope,
-                            const __global float *restrict broad, const __global float *restrict fill,
+                            const __global float *restrict broad, const __global float *restrict span,
+                            const __global float *restrict fill,
                             const __global float *restrict fill_inv, const __global int4 *restrict table,
                             const __global PyramidMatting *restrict matting, PyramidSize size, int segment,
                             __local float *restrict lines)
@@ -564,10 +683,10 @@ __kernel void pyramid_matte(__global float *restrict blur, const __global float 
                 const int x = first + 16 * b;
                 if (x < 0 || x >= sub.z) continue;
                 float16 sum[4], quad[4];
-                matted_block(sum, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x - sub.x,
-                             clamp_index(2 * row - 1, sub.w - 1) - sub.x);
-                matted_block(quad, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x - sub.x,
-                             clamp_index(2 * row, sub.w - 1) - sub.x);
+                matted_block(sum, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps,
+                             x - sub.x, clamp_index(2 * row - 1, sub.w - 1) - sub.x);
+                matted_block(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps,
+                             x - sub.x, clamp_index(2 * row, sub.w - 1) - sub.x);
 #pragma unroll
                 for (int q = 0; q < 4; q++) store_quad_local(line + (16 * b + 4 * q) * 4, sum[q] + quad[q]);
             }
@@ -676,14 +795,15 @@ static inline void store_finished(__global float *out, float16 v, PyramidSize si
 /* pyramid_blend: expands level 1 of every sub-image and lays one over the other, nearest first (eqs. 14-15); crops the
  * guard band.
  * reads   blur  level 1 of sub-images with steps
- *         flat, flat_inv, slope, broad, fill, fill_inv  for the one in focus, which is not blurred
+ *         flat, flat_inv, slope, broad, span, fill, fill_inv  for the one in focus, which is not blurred
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  out  float[height - 2*guard][width - 2*guard][4]
  * range   2-D: (items per row, height - 2*guard), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_blend(__global float *restrict out, const __global float *restrict blur,
                             const __global float *restrict flat, const __global float *restrict flat_inv,
                             const __global float *restrict slope, const __global float *restrict broad,
-                            const __global float *restrict fill, const __global float *restrict fill_inv,
+                            const __global float *restrict span, const __global float *restrict fill,
+                            const __global float *restrict fill_inv,
                             const __global int4 *restrict table,
                             const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
@@ -695,7 +815,7 @@ __kernel void pyramid_blend(__global float *restrict out, const __global float *
             const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
             float16 quad[4];
             if (sub.y == 0) {
-                if (!matted_block(quad, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size,
+                if (!matted_block(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size,
                                   ramps_of(matting, i), x, y)) continue;
             } else {
                 const Between rows = between(level, y + sub.x);

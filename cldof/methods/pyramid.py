@@ -106,7 +106,7 @@ class Matting(NamedTuple):
     seam : ndarray, (N,)
         Part of the front ramp needed per slope of 1/m per px.
     around : ndarray, (N,)
-        Pixels at which to look for the rest of a surface: a sigma of the blur.
+        Pixels at which to look for the rest of a surface, and once more at twice as many: a sigma of the blur.
     """
 
     ramp: NDArray[np.float64]
@@ -231,8 +231,8 @@ class Pyramid:
 
         return Locality(
             max(2 * _MARGIN, 2**steps),
-            # Light spreads that far, and by how much goes by what is a sigma around.
-            math.ceil(3.5 * 2**steps + (blur_radius(steps) if self.matting == "seamless" else 0.0)) + 4,
+            # Light spreads that far, and by how much goes by what is two sigma around.
+            math.ceil(3.5 * 2**steps) + (2 * math.ceil(blur_radius(steps)) if self.matting == "seamless" else 0) + 4,
             reach_px,
             leak,
             # The farthest sub-image culls most.
@@ -445,17 +445,17 @@ class _Builder:
 
     def _run(self, run: str, alpha: int) -> None:
         self._set_defines(alpha)
-        flat, inv, slope, broad, fill, fill_inv, blur = (
-            f"{run}_{name}" for name in ("flat", "flat_inv", "slope", "broad", "fill", "fill_inv", "blur")
+        flat, inv, slope, broad, span, fill, fill_inv, blur = (
+            f"{run}_{name}" for name in ("flat", "flat_inv", "slope", "broad", "span", "fill", "fill_inv", "blur")
         )
         if self.method.matting == "paper":
-            slope = broad = inv
+            slope = broad = span = inv
         stack = self.sources * self.frame_pixels
         steps = int(self.table[:, 0, 1].max())
         for name, nbytes in (
             (flat, stack * 16),
             (inv, stack * 4),
-            *(((slope, stack * 4), (broad, self.frame_pixels * 4)) if slope != inv else ()),
+            *(((slope, stack * 4), (broad, self.frame_pixels * 4), (span, stack // 2)) if slope != inv else ()),
             (fill, self.level_pixels * 16),
             (fill_inv, self.level_pixels * 4),
             (blur, self.level_pixels * 16 if steps else 16),
@@ -463,7 +463,7 @@ class _Builder:
             self.buffers.append(Buffer(name, nbytes))
 
         tables = (read("table"), read("matting"))
-        rgbz = (read(flat), read(inv), read(slope), read(broad))
+        rgbz = (read(flat), read(inv), read(slope), read(broad), read(span))
         filled = (read(fill), read(fill_inv))
         rows = self.sources * self.shape.height
         self._add(
@@ -475,7 +475,7 @@ class _Builder:
         if self.method.matting != "paper":  # else handed over, not read
             self._add(
                 "pyramid_slope",
-                (write(slope), write(broad), read(inv), read("matting"), self.size, np.int32(self.count)),
+                (write(slope), write(broad), write(span), read(inv), read("matting"), self.size, np.int32(self.count)),
                 (self.items, rows),
                 traffic=(8 * self.sources + 4) * self.pixels,
             )

@@ -7,7 +7,7 @@ import pytest
 
 from cldof import Camera, InputError, LayeredFrame, Lens, Renderer
 from cldof.host.device import DeviceInfo
-from cldof.methods.gather import Gather, gather_samples
+from cldof.methods.gather import RADII, Gather, gather_taps
 from tests.frames import noise_frame, plane_frame
 from tests.oracles import gather as oracle
 from tests.oracles.pyramid import EMPTY, flatten
@@ -28,8 +28,8 @@ def test_meets_the_oracle(device_info: DeviceInfo, opaque: bool, kernel: str) ->
     if opaque:
         inverse[np.isinf(frame.depth) & (frame.color[..., 3] == 0)] = EMPTY
     image, inverse, _ = flatten(frame.color.astype(np.float64), inverse, 1, opaque, "true")
-    samples = gather_samples(64, kernel).astype(np.float64)
-    expected = oracle.blur(image[0], inverse[0], samples, *lens.coc_coefficients(frame.camera), kernel == "disc")
+    coefficients = lens.coc_coefficients(frame.camera)
+    expected = oracle.blur(image[0], inverse[0], *gather_taps(64, kernel), RADII, *coefficients, kernel == "disc")
     assert_close(render(device_info, frame, lens, kernel=kernel), expected[5:-5, 5:-5], "gather")
 
 
@@ -44,7 +44,7 @@ def point(depth: float) -> tuple[LayeredFrame, Lens]:
 @pytest.mark.parametrize("kernel", ["disc", "gaussian"])
 def test_a_point_spreads_over_its_coc(device_info: DeviceInfo, kernel: str) -> None:
     frame, lens = point(6.0)
-    light = render(device_info, frame, lens, kernel=kernel, samples=1024)[..., 0].astype(np.float64)
+    light = render(device_info, frame, lens, kernel=kernel, samples=256)[..., 0].astype(np.float64)
     assert light.sum() == pytest.approx(900.0, rel=0.02)
     y, _ = np.mgrid[-40:41, -40:41]
     sigma = math.sqrt((light * y**2).sum() / light.sum())
@@ -66,6 +66,21 @@ def test_a_sharp_thing_does_not_bleed_into_what_is_behind(device_info: DeviceInf
     np.testing.assert_array_equal(aware[:, :40], 1.0)
     assert aware[:, 43:].max() == 0.0
     assert naive[:, 43].min() > 0.05
+
+
+@pytest.mark.parametrize("kernel", ["disc", "gaussian"])
+@pytest.mark.parametrize("samples", [16, 64])
+def test_nothing_jumps(device_info: DeviceInfo, kernel: str, samples: int) -> None:
+    """Lenses a ten-thousandth apart make images nearly as close: through focus, into blur and from step to step."""
+    frame = noise_frame(67, 45, seed=3)
+    distances, change = np.geomspace(1.3, 6.0, 48), []
+    with Renderer("gather", device=device_info.index, samples=samples, kernel=kernel) as renderer:
+        for distance in distances:
+            images = [
+                renderer.render(frame, Lens(9.0 / frame.camera.focal_px, distance * near)).image for near in (1, 1.0001)
+            ]
+            change.append(np.abs(images[0] - images[1]).max())
+    assert 0.0 < max(change) < 3e-3
 
 
 @pytest.mark.parametrize(
