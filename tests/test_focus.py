@@ -296,7 +296,7 @@ def cosine_sweep(camera: Camera, lenses: list[Lens], depth_m: float, period_px: 
     return 0.5 + 0.4 * np.exp(-2.0 * (np.pi * sigma / period_px) ** 2)[:, None] * wave
 
 
-@pytest.mark.parametrize("method", ["layered", "pyramid", "lightfield"])
+@pytest.mark.parametrize("method", ["layered", "pyramid", "lightfield", "gather"])
 def test_a_sweep_of_focus_does_not_jump(method: str, device_info: DeviceInfo) -> None:
     """120 frames: no step is larger than 1.5 times the largest of the theory, as RMS and at any pixel."""
     size, depth, period = 64, 2.0, 16.0
@@ -306,7 +306,8 @@ def test_a_sweep_of_focus_does_not_jump(method: str, device_info: DeviceInfo) ->
     frame = plane_frame(image, depth)
     track = LensTrack.rack(Lens(0.03, 1.2, aperture="gaussian"), 5.0, 120)
     lenses = track.lenses(120)
-    with Renderer(method, device=device_info.index) as renderer:
+    options = {"kernel": "gaussian"} if method == "gather" else {}
+    with Renderer(method, device=device_info.index, **options) as renderer:
         rendered = np.stack([result.image[..., 0] for result in render_track(renderer, frame, lenses)])
     expected = cosine_sweep(frame.camera, lenses, depth, period)
     inner = slice(16, -16)  # edges repeat on the device and go on in theory
