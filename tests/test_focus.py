@@ -296,7 +296,7 @@ def cosine_sweep(camera: Camera, lenses: list[Lens], depth_m: float, period_px: 
     return 0.5 + 0.4 * np.exp(-2.0 * (np.pi * sigma / period_px) ** 2)[:, None] * wave
 
 
-@pytest.mark.parametrize("method", ["layered", "pyramid", "lightfield", "gather"])
+@pytest.mark.parametrize("method", ["gather", "layered", "pyramid", "lightfield", "multiview"])
 def test_a_sweep_of_focus_does_not_jump(method: str, device_info: DeviceInfo) -> None:
     """120 frames: no step is larger than 1.5 times the largest of the theory, as RMS and at any pixel."""
     size, depth, period = 64, 2.0, 16.0
@@ -330,7 +330,7 @@ def picket_sweep(camera: Camera, lenses: list[Lens], depth_m: float, edges: list
     return cover
 
 
-PICKETS = {"layered": 1.5, "pyramid": 1.0}
+PICKETS = {"layered": 1.5, "multiview": 1.2, "pyramid": 1.0}
 
 
 @pytest.mark.parametrize(
@@ -338,6 +338,8 @@ PICKETS = {"layered": 1.5, "pyramid": 1.0}
     [
         ("layered", 0.0, 4.0),
         ("layered", 0.004, 4.0),
+        ("multiview", 0.0, 4.0),
+        ("multiview", 0.0, 1.15),
         ("pyramid", 0.0, 4.0),
         ("pyramid", 0.004, 4.0),
         ("pyramid", 0.0, 1.15),  # both within one interval between two blurs

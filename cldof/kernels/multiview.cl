@@ -4,7 +4,8 @@
  * pixels and C rays are straight (eq. 3 of the paper). The frame's peels are split into layers of equal CoC growth
  * (eq. 4), so thin that a ray moves by less than a pixel inside one. There the height field needs no search, and all
  * 16 pixels of a run move by the same whole number of pixels: the way of 16 rays through a layer is one contiguous,
- * unaligned load. Gathers, which CPUs are slow at, do not occur.
+ * unaligned load. Gathers, which CPUs are slow at, do not occur. On its way from one pixel to the next a ray takes both
+ * in for a short while, so that an image whose focus moves does not jump.
  *
  * Layer s holds the inverse depths between its bounds and is met in its middle, or at the mean C of what it holds. Its
  * bounds stand still in the scene while the focus moves, so that all that it holds is blurred more or less evenly. Layers
@@ -81,13 +82,21 @@ typedef struct {
  *   largest  the largest blur radius that it may be met at, px
  *   scale    of rays' moves; below 1 where the width of windows is part of the blur
  *   window   half the width of its cones, fine pixels
+ *   haste    one over the way of a ray, px, on which it passes from one pixel to the next
  *   reach    fine cells that its rays and cones may move to either side
  *   needs    number of the set of rays that its blur takes, and 256 times that for bright light in it */
 typedef struct {
     float bound[MULTIVIEW_MAX_LAYERS + 1], coc[MULTIVIEW_MAX_LAYERS], largest[MULTIVIEW_MAX_LAYERS];
-    float scale[MULTIVIEW_MAX_LAYERS], window[MULTIVIEW_MAX_LAYERS];
+    float scale[MULTIVIEW_MAX_LAYERS], window[MULTIVIEW_MAX_LAYERS], haste[MULTIVIEW_MAX_LAYERS];
     int reach[MULTIVIEW_MAX_LAYERS], needs[MULTIVIEW_MAX_LAYERS];
 } MultiviewPlaces;
+
+/* Where a ray meets a layer, px right and down from its pixel: in a whole one, and for so great a share also in the next
+ * one to either side; the share is below 0 where that is the left or the upper one, and 0.5 at most. */
+typedef struct {
+    int x, y;
+    float to_x, to_y;
+} MultiviewShift;
 
 /* Layers between the near end of the first layer and an inverse depth, with a fraction. */
 static inline float16 layer_at(float16 w, MultiviewSteps steps)
@@ -270,19 +279,31 @@ __kernel void multiview_centres(__global float *restrict coc, const __global flo
     coc[s] = share > 0.0f && weight > 0.0f ? middle + share * (total / weight - middle) : middle;
 }
 
+/* How much of the next pixel a ray takes in that has gone `past` the middle of its own, up to half a pixel. */
+static inline float next_share(float past, float haste)
+{
+    const float share = 0.5f - (0.5f - (past < 0.0f ? -past : past)) * haste;
+    return share <= 0.0f ? 0.0f : past < 0.0f ? -share : share;
+}
+
 /* multiview_shifts: how many pixels each ray has moved at each layer.
  * reads   points  float2[rays]    on the lens, right and down, in units of its radius
  *         coc     float[layers]   px
  *         places  MultiviewPlaces
- * writes  shifts  int2[rays][layers]  right and down
+ * writes  shifts  MultiviewShift[rays][layers]
  * range   2-D, one item per layer and ray, any local size */
-__kernel void multiview_shifts(__global int2 *restrict shifts, const __global float2 *restrict points,
+__kernel void multiview_shifts(__global MultiviewShift *restrict shifts, const __global float2 *restrict points,
                                const __global float *restrict coc, const __global MultiviewPlaces *restrict places,
                                int layers, int rays)
 {
     const int s = get_global_id(0), i = get_global_id(1);
     if (s >= layers || i >= rays) return;
-    shifts[i * layers + s] = convert_int2_rtn(points[i] * (places->scale[s] * coc[s]) + 0.5f);
+    const float2 to = points[i] * (places->scale[s] * coc[s]);
+    const int2 by = convert_int2_rtn(to + 0.5f);
+    const float2 past = to - convert_float2(by);
+    const float haste = places->haste[s];
+    const MultiviewShift shift = {by.x, by.y, next_share(past.x, haste), next_share(past.y, haste)};
+    shifts[i * layers + s] = shift;
 }
 
 /* multiview_bright: which layers have light in a cell that a disc of blur shows; the first level of an N-buffer.
@@ -692,13 +713,13 @@ __kernel void multiview_finish(__global float *restrict image, const __global fl
  *         lists     uint[cells_y][cells_x]
  *         sets      int[cells_y][cells_x]
  *         ray_sets  int2[sets * STRIDE^2]  first ray and number of rays
- *         shifts    int2[rays][layers]  px, how far each ray has moved at each layer
+ *         shifts    MultiviewShift[rays][layers]
  * writes  image     float[output height][output width][4]; or, with MULTIVIEW_PARTS, adds to parts as multiview_finish
  *                   has them, or begins them with the `first` group
  * range   2-D, one item per MULTIVIEW_SPAN pixels of an output row, any local size */
 __kernel void multiview_trace(__global float *restrict image, const __global float *restrict layers,
                               const __global uint *restrict lists, const __global int *restrict sets,
-                              const __global int2 *restrict ray_sets, const __global int2 *restrict shifts,
+                              const __global int2 *restrict ray_sets, const __global MultiviewShift *restrict shifts,
                               const __global float *restrict color,
 #if MULTIVIEW_PEELED
                               const __global float *restrict inv_depth, const __global float *restrict extent,
@@ -737,49 +758,92 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
         float16 past[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
 #endif
         for (int i = 0; i < rays.y; i++) {
-            const __global int2 *shift = shifts + (size_t)(rays.x + i) * size.layers;
+            const __global MultiviewShift *shift = shifts + (size_t)(rays.x + i) * size.layers;
             float16 left[4] = {(float16)(1.0f), (float16)(1.0f), (float16)(1.0f), (float16)(1.0f)};
             float open = 1.0f;
             for (int k = 0; k < count + MULTIVIEW_VOID && open > 0.0f; k++) {
                 const int s = k < count ? order[k] : size.layers;
                 /* The void is at infinity, in the last layer. */
-                const int2 by = shift[s < size.layers ? s : s - 1];
-                const int x = x0 + by.x, row = y + by.y, inside = clamp_index(row, size.height - 1);
-                float16 c[4];
-                const int is_inside = x >= 0 && x + MULTIVIEW_SPAN <= size.width && row == inside;
-#if MULTIVIEW_PEELED
-                if (s < size.layers) {
-                    const float2 ends = ends_of(places, s, size.layers);
-#if MULTIVIEW_REFINE
-                    const float2 limits = (float2)(places->bound[s], places->bound[s + 1]) * c1 + c0;
-                    refined_quads(c, color, inv_depth, extent, size, c1, c0, ends, limits, points[rays.x + i], x0, y);
-#else
-                    peeled_quads(c, color, inv_depth, extent, size, ends, x, inside, is_inside, row != inside);
-#endif
-                } else
-#endif
-                {
-                    const int slot = MULTIVIEW_PEELED ? 0 : s;
-                    const __global float *from = layers + slot * layer_floats + (size_t)inside * size.pitch * 4;
+                const MultiviewShift by = shift[s < size.layers ? s : s - 1];
+                const int x = x0 + by.x, row = y + by.y;
+                const float share_x = by.to_x < 0.0f ? -by.to_x : by.to_x;
+                const float share_y = by.to_y < 0.0f ? -by.to_y : by.to_y;
+                const int over = by.to_x < 0.0f ? -1 : 1, down = by.to_y < 0.0f ? -1 : 1;
+                const int is_between = !MULTIVIEW_REFINE && (share_x > 0.0f || share_y > 0.0f);
+                const int rim = is_between ? 1 : 0;
+                const int is_inside = x >= rim && x + MULTIVIEW_SPAN + rim <= size.width && row >= rim &&
+                                      row + rim < size.height;
+                const __global float *layer = layers + (MULTIVIEW_PEELED ? 0 : s) * layer_floats;
+                /* What the ray meets as far as it is known, and how much light that blocks. */
+                float16 c[4], blocks[4];
+                if (!MULTIVIEW_PEELED && is_inside) {
+                    const __global float *at = layer + ((size_t)row * size.pitch + x) * 4;
 #pragma unroll
-                    for (int q = 0; q < 4; q++) {
-                        const int at = x + 4 * q * MULTIVIEW_STRIDE;
-                        c[q] = is_inside ? layer_quad(from + at * 4) : edge_quad(from, at, row != inside, size.width);
+                    for (int q = 0; q < 4; q++) c[q] = layer_quad(at + 16 * q * MULTIVIEW_STRIDE);
+                    if (is_between) {
+                        const __global float *side = at + 4 * over, *next = at + 4 * down * size.pitch;
+                        const __global float *corner = next + 4 * over;
+                        if (share_x > 0.0f)
+#pragma unroll
+                            for (int q = 0; q < 4; q++)
+                                c[q] += share_x * (layer_quad(side + 16 * q * MULTIVIEW_STRIDE) - c[q]);
+                        if (share_y > 0.0f)
+#pragma unroll
+                            for (int q = 0; q < 4; q++) {
+                                float16 v = layer_quad(next + 16 * q * MULTIVIEW_STRIDE);
+                                v += share_x * (layer_quad(corner + 16 * q * MULTIVIEW_STRIDE) - v);
+                                c[q] += share_y * (v - c[q]);
+                            }
+                    }
+#pragma unroll
+                    for (int q = 0; q < 4; q++) blocks[q] = c[q].s33337777bbbbffff;
+                } else {
+                    for (int q = 0; q < 4; q++) c[q] = (float16)(0.0f), blocks[q] = (float16)(0.0f);
+                    for (int tap = 0; tap < (is_between ? 4 : 1); tap++) {
+                        const int is_over = tap & 1, is_down = tap >> 1;
+                        float share = 1.0f;
+                        if (is_between)
+                            share = (is_over ? share_x : 1.0f - share_x) * (is_down ? share_y : 1.0f - share_y);
+                        if (share <= 0.0f) continue;
+                        const int column = x + is_over * over, line = row + is_down * down;
+                        const int inside = clamp_index(line, size.height - 1);
+                        float16 v[4];
+#if MULTIVIEW_PEELED
+                        if (s < size.layers) {
+                            const float2 ends = ends_of(places, s, size.layers);
+#if MULTIVIEW_REFINE
+                            const float2 limits = (float2)(places->bound[s], places->bound[s + 1]) * c1 + c0;
+                            refined_quads(v, color, inv_depth, extent, size, c1, c0, ends, limits, points[rays.x + i],
+                                          x0, y);
+#else
+                            const int is_whole = column >= 0 && column + MULTIVIEW_SPAN <= size.width && line == inside;
+                            peeled_quads(v, color, inv_depth, extent, size, ends, column, inside, is_whole,
+                                         line != inside);
+#endif
+                        } else
+#endif
+                            for (int q = 0; q < 4; q++)
+                                v[q] = edge_quad(layer + (size_t)inside * size.pitch * 4,
+                                                 column + 4 * q * MULTIVIEW_STRIDE, line != inside, size.width);
+                        for (int q = 0; q < 4; q++) {
+                            float16 alpha = v[q].s33337777bbbbffff;
+                            c[q] += alpha < 0.0f ? (float16)(0.0f) : share * v[q];
+                            blocks[q] += share * (alpha < 0.0f ? -alpha : alpha);
+                        }
                     }
                 }
                 float16 rest = (float16)(0.0f);
 #if MULTIVIEW_VOID
                 if (s == size.layers) {
 #pragma unroll
-                    for (int q = 0; q < 4; q++) past[q] += c[q] > 0.0f ? left[q] * c[q] : (float16)(0.0f);
+                    for (int q = 0; q < 4; q++) past[q] += left[q] * c[q];
                     continue;
                 }
 #endif
 #pragma unroll
                 for (int q = 0; q < 4; q++) {
-                    float16 alpha = c[q].s33337777bbbbffff;
-                    sum[q] += alpha < 0.0f ? (float16)(0.0f) : left[q] * c[q];
-                    left[q] -= left[q] * (alpha < 0.0f ? -alpha : alpha);
+                    sum[q] += left[q] * c[q];
+                    left[q] -= left[q] * blocks[q];
                     rest += left[q];
                 }
                 open = sum16(rest);

@@ -48,6 +48,7 @@ __all__ = [
     "cones",
     "ray_sets",
     "shift_scales",
+    "turn_px",
 ]
 
 # Constants of kernels/multiview.cl.
@@ -76,11 +77,18 @@ _FEWEST_TO_REFINE = 24
 _CONE_WIDTH = 1.1
 # With several samples a pixel: below this C a window does all of the blur, up to that one it is taken off the rays'.
 _WINDOW_PX, _MATCHED_PX = 0.8, 4.0
+# Way of a ray, px, on which it passes from one pixel to the next: takes both in. Wider is smoother and dearer. Close to
+# the focus, where theory changes least and a ray's step shows most, the first; at C px the third over C; at least the
+# second.
+_TURN_PX, _LEAST_TURN_PX, _TURN_COC = 0.4, 0.05, 0.4
+# As far as this C it is tabulated what rays of whole pixels blur by, in steps of so much, px.
+_TABLED_PX, _TABLE_STEP_PX = 6.0, 0.01
 # Layers nearer to the focus are met in their middle: there whole pixels of shift blur more than they should. Those that
 # stand still in the scene go over to the mean as far as the second figure.
 _CENTRED_PX, _ALL_CENTRED_PX = 0.8, 1.2
 # Layers that stand still in the scene are in focus where their middle is within half of their growth and this.
 _FOCUS_PX = 0.125
+_RAMP_PX = 0.25
 # Rays that move by less all stay in their pixel.
 _STILL_PX = 0.499
 # Light above this (constant of kernels/multiview.cl) that is blurred by so many px gets so many times the rays.
@@ -100,10 +108,11 @@ _STEPS = np.dtype([(n, np.float32) for n in ("anchor", "fine", "coarse", "turn",
 _PLACES = np.dtype(
     [
         ("bound", np.float32, MAX_LAYERS + 1),
-        *((n, np.float32, MAX_LAYERS) for n in ("coc", "largest", "scale", "window")),
+        *((n, np.float32, MAX_LAYERS) for n in ("coc", "largest", "scale", "window", "haste")),
         *((n, np.int32, MAX_LAYERS) for n in ("reach", "needs")),
     ]
 )
+_SHIFT = np.dtype([("x", np.int32), ("y", np.int32), ("to_x", np.float32), ("to_y", np.float32)])
 _FLOAT = np.dtype(np.float32)
 
 
@@ -227,21 +236,25 @@ class Layering(NamedTuple):
         limits = np.abs(self.limits)
         return np.maximum(limits[1:], limits[:-1])
 
-    def met(self, farthest: float, aperture: Aperture) -> NDArray[np.float64]:
-        """C in px at which layers are met, (K,): in their middle, less what whole pixels of shift blur by themselves.
+    def met(self, farthest: float, aperture: Aperture, turning: bool) -> NDArray[np.float64]:
+        """C in px at which layers are met, (K,): where what rays take in is as wide as the lens says for the middle.
 
         Rays move by up to ``farthest`` px per px of C. What is in focus stays where it is, and so does all of a layer
-        whose middle is no farther from it than half a layer: from there on blur grows from nothing.
+        whose middle is no farther from it than half a layer: from there on variance grows from nothing, evenly until
+        that meets the parabola that it should be, in a tangent.
         """
         coc = self.coc
         if self.refined:
             return coc
         away, least = np.abs(coc), self.delta_px / 2.0 + _FOCUS_PX
-        rounding = 1.0 / (12.0 * float(_points(aperture).var(axis=0).mean()))
-        joint = max(1.0, 2.0 * least, math.sqrt(2.0 * rounding))
-        knots = (0.0, least, joint), (0.0, _STILL_PX / max(farthest, 1e-6), math.sqrt(joint**2 - rounding))
-        eased = np.where(away < joint, np.interp(away, *knots), np.sqrt(np.maximum(away**2 - rounding, 0.0)))
-        return np.asarray(np.sign(coc) * eased)
+        joint = least + min(least, _RAMP_PX)
+        wanted = np.where(away < joint, joint**2 * (away - least) / (joint - least), away**2)
+        tabled, blurs = _blurs(aperture, turning)
+        start = _still_px(turning) / max(farthest, 1e-6)
+        # Far from the focus what whole pixels add is as good as constant.
+        met = np.maximum(np.interp(wanted, blurs, tabled), start)
+        met = np.where(wanted > blurs[-1], np.sqrt(np.maximum(wanted - blurs[-1] + tabled[-1] ** 2, 0.0)), met)
+        return np.asarray(np.sign(coc) * np.where(away < least, start * away / least, met))
 
 
 class Cone(NamedTuple):
@@ -431,10 +444,11 @@ class Multiview:
             eyes = min(self.eyes, self.rays)
         halvings = self.halvings(where.delta_px)
         rays = ray_sets(self, lens.aperture, max(1, eyes))
-        met, largest = where.met(rays.farthest, lens.aperture), where.largest
+        met, largest = where.met(rays.farthest, lens.aperture, not halvings), where.largest
         windows = self.windows(where, lens.aperture)
         scales = shift_scales(where.coc, self.supersample, lens.aperture, self.antialias)
-        moves = np.floor(rays.farthest * scales * (largest + 1e-3) + 0.5) * self.supersample
+        turns = turn_px(scales * met)
+        moves = np.floor(rays.farthest * scales * (largest + 1e-3) + 0.5 + turns / 2.0) * self.supersample
         halos = np.array([max(-w.first, w.first + w.taps) + 1 if w else 0 for w in windows])
         needs = rays.needs(largest if halvings else np.abs(met), self.adaptive)
         places = np.zeros((), _PLACES)
@@ -444,6 +458,7 @@ class Multiview:
             ("largest", largest),
             ("scale", scales),
             ("window", [w.half if w else 0.5 for w in windows]),
+            ("haste", 1.0 / turns),
             ("reach", np.minimum(np.ceil((moves + halos) / CELL), 1e6)),
             ("needs", needs[:, 0] + 256 * needs[:, 1]),
         ):
@@ -511,7 +526,8 @@ class Multiview:
         limits = float(plan.params["c1"]) * places["bound"][: count + 1].astype(np.float64) + float(plan.params["c0"])
         # After a search for what is in a layer, those stay that rays do not leave from end to end.
         met = np.abs(places["largest" if layers.halvings else "coc"][:count])
-        moved = met * ray_sets(self, layers.aperture, 1).farthest >= 0.4999
+        still_px = _still_px(not layers.halvings) + 9e-4
+        moved = met * ray_sets(self, layers.aperture, 1).farthest >= still_px
         # The least blur of anything in a layer that rays move in; a slot so close to a bound may count for both.
         gap = np.maximum(np.maximum(limits[:-1], -limits[1:]), 0.0)[moved] - 2e-3 * plan.summary["delta_px"]
         still = float(gap.min(initial=np.inf))
@@ -565,6 +581,38 @@ def cones(
     return windows
 
 
+def turn_px(coc: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Way in px on which rays of layers at these C pass from one pixel to the next."""
+    return np.clip(_TURN_COC / np.maximum(np.abs(coc), 1e-6), _LEAST_TURN_PX, _TURN_PX)
+
+
+def _still_px(turning: bool) -> float:
+    """Rays that move by less take in no pixel but their own."""
+    return _STILL_PX - _TURN_PX / 2.0 if turning else _STILL_PX
+
+
+def _variance(points: NDArray[np.float64], coc: NDArray[np.float64], turning: bool) -> NDArray[np.float64]:
+    """Of what the rays through these points of the lens take in at each C, px^2, the mean of both axes."""
+    to = coc[:, None, None] * points
+    pixel = np.floor(to + 0.5)
+    past = to - pixel
+    turn = turn_px(coc)[:, None, None] if turning else 1e-9
+    share = np.maximum(0.5 - (0.5 - np.abs(past)) / turn, 0.0)
+    mean = (pixel + share * np.sign(past)).mean(axis=1)
+    square = ((1.0 - share) * pixel**2 + share * (pixel + np.sign(past)) ** 2).mean(axis=1)
+    return np.asarray((square - mean**2).mean(axis=-1))
+
+
+@cache
+def _blurs(aperture: Aperture, turning: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """C in px at which rays are, rising, and the square of the C that they blur by there."""
+    points = _points(aperture)
+    coc = np.arange(0.0, _TABLED_PX, _TABLE_STEP_PX)
+    blurs = _variance(points, coc, turning) / points.var(axis=0).mean()
+    # Rising, be it by nothing to speak of: an inverse needs that.
+    return coc, np.maximum.accumulate(blurs) + 1e-9 * coc
+
+
 @cache
 def _points(aperture: Aperture) -> NDArray[np.float64]:
     return aperture.samples(256)
@@ -599,7 +647,7 @@ def _matched_scale(coc: float, aperture: Aperture, antialias: bool) -> float:
     points = _points(aperture)
     tries = np.linspace(0.0, 1.2, 241)
     wanted = coc**2 * points.var(axis=0).mean() + (0.0 if antialias else -1.0 / 12.0)
-    found = np.floor(coc * tries[:, None, None] * points + 0.5).var(axis=1).mean(axis=1)
+    found = _variance(points, coc * tries, turning=True)
     return float(tries[np.abs(found - wanted).argmin()])
 
 
@@ -805,7 +853,7 @@ class _Builder:
         self._nbuffer("bright")
         count = len(rays.points)
         self._constant("points", rays.points)
-        self.buffers.append(Buffer("shifts", count * self.layers.total * 8))
+        self.buffers.append(Buffer("shifts", count * self.layers.total * _SHIFT.itemsize))
         self._add(
             "multiview_shifts",
             (
@@ -832,7 +880,7 @@ class _Builder:
                 np.int32(self.levels),
                 np.int32(self.method.cull),
                 np.float32(rays.farthest),
-                np.float32(_STILL_PX if self.method.adaptive or self.layers.total == 1 else -1.0),
+                np.float32(_still_px(not self.halvings) if self.method.adaptive or self.layers.total == 1 else -1.0),
             ),
             self.cells,
         )

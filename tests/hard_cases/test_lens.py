@@ -108,11 +108,11 @@ def sweep(subject: Subject, side: float) -> np.ndarray:
 
 # The most that a pixel beside an edge of contrast 1 changes when the CoC radius grows by 0.01 px. A disc that grows
 # evenly changes it by at most 0.01. Methods of samples take steps of a sample, and those of layers steps of a layer.
-JUMP = {"gather": 0.012, "layered": 0.01, "lightfield": 0.01, "multiview": 0.05, "pyramid": 0.01, "pyramid paper": 0.25}
+JUMP = {"gather": 0.012, "layered": 0.01, "lightfield": 0.01, "multiview": 0.01, "pyramid": 0.01, "pyramid paper": 0.25}
 # How far the blur may be from the CoC radius, px. Between two sub-images a pyramid mixes sharp and blurred.
 OFF = {
-    "multiview": 0.85,
-    "multiview peels": 0.85,
+    "multiview": 0.2,
+    "multiview peels": 0.2,
     "layered": 0.2,
     "layered single": 0.4,
     "layered paper": 0.7,

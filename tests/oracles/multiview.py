@@ -74,9 +74,23 @@ def centres(
     return coc
 
 
-def shifts(points: np.ndarray, coc: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Right and down in px, (rays, K, 2)."""
-    return np.floor(points[:, None] * (scales * coc)[None, :, None] + 0.5).astype(int)
+def shifts(points: np.ndarray, coc: np.ndarray, scales: np.ndarray, turns: np.ndarray | None = None) -> np.ndarray:
+    """What rays take in of each layer, (rays, K, 4, 3): four pixels right and down, and the share of each.
+
+    A ray whose place is within half of the layer's ``turns`` (px) of the line between two pixels takes both in, evenly
+    more of one and less of the other.
+    """
+    to = points[:, None] * (scales * coc)[None, :, None]
+    pixel = np.floor(to + 0.5)
+    share = np.zeros_like(to)
+    if turns is not None:
+        share = np.maximum(0.5 - (0.5 - np.abs(to - pixel)) / turns[None, :, None], 0.0)
+    side = np.where(to < pixel, -1.0, 1.0)
+    taps = []
+    for is_over, is_down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        of = (np.array([is_over, is_down]) * share + np.array([1 - is_over, 1 - is_down]) * (1.0 - share)).prod(axis=-1)
+        taps.append(np.concatenate([pixel + side * (is_over, is_down), of[..., None]], axis=-1))
+    return np.stack(taps, axis=2)
 
 
 def cone(image: np.ndarray, first: int, taps: int, edge: float, scale: int = 1) -> np.ndarray:
@@ -115,8 +129,8 @@ def trace(layers: np.ndarray, shifts: np.ndarray, color: np.ndarray, void: np.nd
     Parameters
     ----------
     layers : (K, H, W, 4)
-    shifts : (rays, K, 2)
-        Right and down, in px.
+    shifts : (rays, K, 4, 3)
+        As ``shifts`` has them.
     color : (M, H, W, 4)
         The peels at the middle of each pixel: what pixels without rays show.
     void : (H, W), optional
@@ -131,14 +145,18 @@ def trace(layers: np.ndarray, shifts: np.ndarray, color: np.ndarray, void: np.nd
     total, known = np.zeros((height, width, 4)), np.zeros((height, width))
     for ray in shifts:
         left = np.ones((height, width))
-        for layer, (dx, dy) in zip(layers, ray, strict=True):
-            at_x, at_y = np.clip(x + dx, 0, width - 1), np.clip(y + dy, 0, height - 1)
-            inside = (at_x == x + dx) & (at_y == y + dy)
-            met = layer[at_y, at_x]
-            total += np.where(inside, left, 0.0)[..., None] * met
-            left = left * (1.0 - met[..., 3])
+        for layer, taps in zip(layers, ray, strict=True):
+            places = []
+            met, blocks = np.zeros((height, width, 4)), np.zeros((height, width))
+            for dx, dy, share in taps:
+                at_x, at_y = (np.clip(v, 0, n - 1).astype(int) for v, n in ((x + dx, width), (y + dy, height)))
+                places.append((at_y, at_x, share * ((at_x == x + dx) & (at_y == y + dy))))
+                met += places[-1][2][..., None] * layer[at_y, at_x]
+                blocks += share * layer[at_y, at_x, 3]
+            total += left[..., None] * met
+            left = left * (1.0 - blocks)
         if void is not None:
-            known += np.where(inside, left * void[at_y, at_x], 0.0)
+            known += left * sum(share * void[at_y, at_x] for at_y, at_x, share in places)
     return finish(total, known, len(shifts), color, void is None)
 
 
@@ -227,6 +245,7 @@ def render(
     windows: list,
     points: np.ndarray,
     scales: np.ndarray,
+    turns: np.ndarray,
     *,
     opaque: bool,
     guard: int = 0,
@@ -250,7 +269,7 @@ def render(
     layers = split(color, columns, bounds)
     cones = [cone(one, *window, scale) if window else one for one, window in zip(layers, windows, strict=True)]
     middle = color[:, scale // 2 :: scale, scale // 2 :: scale]
-    image = trace(np.stack(cones), shifts(points, coc, scales), middle, None if opaque else past(color, scale))
+    image = trace(np.stack(cones), shifts(points, coc, scales, turns), middle, None if opaque else past(color, scale))
     return image[inner, inner]
 
 
