@@ -12,6 +12,7 @@ Where this differs from the paper, docs/methods/multiview.md has the measurement
 - Layers stand still in the scene while the focus moves (with one sample a pixel), not at fixed circles of confusion.
 - Layers overlap as far as the surface slopes from pixel to pixel, not by a fixed 10 %.
 - Cones see means over windows of exactly their width, not mip levels.
+- Rays take in two pixels for a short while on their way from one to the next, so that a moving focus does not jump.
 - The number of rays follows the blur of what a cell of 16 x 16 pixels can see, and rises where light is bright.
 - Frames may have several samples a pixel, which layers take in; around the focus they are thinner then.
 - Glossy surfaces are shaded from points all over the lens before cones take their means, not at the hit after means of
@@ -77,17 +78,17 @@ _FEWEST_TO_REFINE = 24
 _CONE_WIDTH = 1.1
 # With several samples a pixel: below this C a window does all of the blur, up to that one it is taken off the rays'.
 _WINDOW_PX, _MATCHED_PX = 0.8, 4.0
-# Way of a ray, px, on which it passes from one pixel to the next: takes both in. Wider is smoother and dearer. Close to
-# the focus, where theory changes least and a ray's step shows most, the first; at C px the third over C; at least the
-# second.
+# Way of a ray, px, on which it passes from one pixel to the next: takes both in. Wider is smoother and dearer. At most the
+# first, close to the focus, where theory changes least and a ray shows most; farther the third over C; at least the second.
 _TURN_PX, _LEAST_TURN_PX, _TURN_COC = 0.4, 0.05, 0.4
-# As far as this C it is tabulated what rays of whole pixels blur by, in steps of so much, px.
+# As far as this C it is tabulated what rays blur by, in steps of so much, px.
 _TABLED_PX, _TABLE_STEP_PX = 6.0, 0.01
 # Layers nearer to the focus are met in their middle: there whole pixels of shift blur more than they should. Those that
 # stand still in the scene go over to the mean as far as the second figure.
 _CENTRED_PX, _ALL_CENTRED_PX = 0.8, 1.2
 # Layers that stand still in the scene are in focus where their middle is within half of their growth and this.
 _FOCUS_PX = 0.125
+# From there to where their blur is right, px of C.
 _RAMP_PX = 0.25
 # Rays that move by less all stay in their pixel.
 _STILL_PX = 0.499
@@ -97,7 +98,7 @@ _BRIGHT, _BRIGHT_PX, _BRIGHT_RAYS = 1.5, 1.5, 4
 # more.
 _COARSE_PX, _USUAL_HALVINGS = 2.0, 2
 # Rays per px^2 of the largest circle of confusion that a cell can see: more are not traced. Costs up to 0.2 dB. Where
-# rays move at all there are at least 64: each that moves on by a pixel is a step when the focus moves.
+# rays move at all there are at least 64: where cells go from set to set while the focus moves, the image jumps.
 _RAYS_PER_PX2, _FEWEST_RAYS_LOG2 = 4.0, 6
 # Pixels of the jitter pattern along x and y, and the order in which Bayer 1973 fills the pattern: row by row.
 _JITTER = 4
@@ -240,8 +241,15 @@ class Layering(NamedTuple):
         """C in px at which layers are met, (K,): where what rays take in is as wide as the lens says for the middle.
 
         Rays move by up to ``farthest`` px per px of C. What is in focus stays where it is, and so does all of a layer
-        whose middle is no farther from it than half a layer: from there on variance grows from nothing, evenly until
-        that meets the parabola that it should be, in a tangent.
+        whose middle is no farther from it than half a layer. From there variance grows from nothing, evenly, until it
+        is what it should be.
+
+        Parameters
+        ----------
+        farthest : float
+        aperture : Aperture
+        turning : bool
+            Whether rays pass from pixel to pixel evenly, or as a whole.
         """
         coc = self.coc
         if self.refined:
@@ -251,7 +259,7 @@ class Layering(NamedTuple):
         wanted = np.where(away < joint, joint**2 * (away - least) / (joint - least), away**2)
         tabled, blurs = _blurs(aperture, turning)
         start = _still_px(turning) / max(farthest, 1e-6)
-        # Far from the focus what whole pixels add is as good as constant.
+        # Far from the focus what pixels add to the blur is as good as constant.
         met = np.maximum(np.interp(wanted, blurs, tabled), start)
         met = np.where(wanted > blurs[-1], np.sqrt(np.maximum(wanted - blurs[-1] + tabled[-1] ** 2, 0.0)), met)
         return np.asarray(np.sign(coc) * np.where(away < least, start * away / least, met))

@@ -78,7 +78,7 @@ def test_a_plane_a_thousand_kilometres_away(subject: Subject, focus_m: float) ->
     image = subject.render(far, lens)
     keep_promises(subject, case, far, image)
     # Less than 2e-5 px of CoC apart; the light field moves slots by steps of 1/256 px, rays pass from pixel to pixel
-    # on the twentieth of one.
+    # on the twentieth of one, at the least.
     bound = {"lightfield": 1e-3, "multiview": 4e-5}.get(subject.method, 1e-5)
     subject.check(case, "against infinity", np.abs(image - subject.render(infinite, lens)).max(), bound)
 
