@@ -78,8 +78,8 @@ _FEWEST_TO_REFINE = 24
 _CONE_WIDTH = 1.1
 # With several samples a pixel: below this C a window does all of the blur, up to that one it is taken off the rays'.
 _WINDOW_PX, _MATCHED_PX = 0.8, 4.0
-# Way of a ray, px, on which it passes from one pixel to the next: takes both in. Wider is smoother and dearer. At C px it
-# is the third over C, but no more than the first, where theory changes least and rays show most, nor less than the second.
+# Way of a ray, px, on which it passes from one pixel to the next: takes both in. Wider is smoother and dearer. At C px
+# it is the third over C, but at most the first, where theory changes least and rays show most, and at least the second.
 _TURN_PX, _LEAST_TURN_PX, _TURN_COC = 0.4, 0.05, 0.4
 # As far as this C it is tabulated what rays blur by, in steps of so much, px.
 _TABLED_PX, _TABLE_STEP_PX = 6.0, 0.01
