@@ -313,7 +313,7 @@ class Choice:
 # Of the errors' model: variances of what is linear in the features and of the bells around cases, the bells' width in
 # standard deviations of features (root mean square), and the variance of what no feature tells. Chosen by what models
 # of all but one lens, and of all but one scene, say of those left out.
-_LINEAR, _BELL, _REACH, _NOISE = 0.3, 1.0, 0.4, 0.05
+_LINEAR, _BELL, _REACH, _NOISE = 0.3, 1.0, 0.4, 0.02
 
 
 class ErrorModel:

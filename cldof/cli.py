@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     tune = commands.add_parser(
         "tune",
         help="measure what methods cost on a device, for --method auto",
-        description="Measure what settings cost on a device, three to four minutes, and keep it for --method auto.",
+        description="Measure what settings cost on a device, some six minutes, and keep it for --method auto.",
     )
     tune.set_defaults(run=_tune)
     tune.add_argument("frames", nargs="*", metavar="FRAME", help="frames saved as .npz, in place of built-in scenes")

@@ -1,6 +1,6 @@
 """``cldof tune``: measure what settings cost on a device, and how far they err, for ``method="auto"``.
 
-How far a setting errs does not depend on the device, so as a rule only times are measured, in three to four minutes;
+How far a setting errs does not depend on the device, so as a rule only times are measured, in some six minutes;
 errors are those that come with cldof. :func:`measure_errors` measures them anew, against accumulated references.
 
 Times are kept as ratios to a copy of 16 MB in the same run, so that they hold roughly for similar devices too.

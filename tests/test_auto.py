@@ -213,7 +213,7 @@ def test_cases_are_left_out_as_if_they_had_not_been_measured() -> None:
     errors, _, _ = rows(6, 30)
     feature, db = np.array([row.feature for row in errors]), np.array([row.db for row in errors])
     model = ErrorModel(feature, db)
-    inner = model._kernel(model._seen) + 0.05 * np.eye(30)
+    inner = model._kernel(model._seen) + 0.02 * np.eye(30)
     mean, spread = model.left_out()
     for case in (0, 17):
         rest = np.arange(30) != case
@@ -441,13 +441,13 @@ def test_errors_are_the_gaussian_process_of_the_book() -> None:
         near = math.exp(-0.5 * np.mean((first - second) ** 2) / 0.4**2)
         return float(0.3 * np.mean(first * second) + near)
 
-    inner = np.array([[kernel(a, b) for b in feature] for a in feature]) + 0.05 * np.eye(len(feature))
+    inner = np.array([[kernel(a, b) for b in feature] for a in feature]) + 0.02 * np.eye(len(feature))
     at = 0.5 * (feature[3] + feature[8])
     row = np.array([kernel(at, b) for b in feature])
     rest = db - db.mean(axis=0)
     expected = db.mean(axis=0) + row @ np.linalg.solve(inner, rest)
     scale = np.mean(rest * np.linalg.solve(inner, rest), axis=0)
-    variance = (kernel(at, at) - row @ np.linalg.solve(inner, row) + 0.05) * scale
+    variance = (kernel(at, at) - row @ np.linalg.solve(inner, row) + 0.02) * scale
     found, deviation = ErrorModel(feature, db).predict(at)
     assert found == pytest.approx(expected, rel=1e-9) and deviation == pytest.approx(np.sqrt(variance), rel=1e-7)
 
