@@ -247,7 +247,8 @@ class Renderer:
     ----------
     method : str
         Name of the method; see :data:`cldof.methods.METHODS`. ``"auto"`` takes the options ``max_error`` or ``max_ms``
-        and chooses a method for every frame (:mod:`cldof.auto`, docs/auto.md).
+        and chooses a method for every frame (:mod:`cldof.auto`, docs/auto.md); where the image's own pixels are too
+        coarse it takes finer frames (:meth:`cldof.LayeredFrame.with_finer`).
     device : int or str, optional
         As :meth:`cldof.host.device.Device.open`: an index, ``"cpu"``, ``"gpu"`` or part of a name. None takes the
         environment's ``CLDOF_DEVICE``, else a GPU, else a CPU.

@@ -41,7 +41,9 @@ class Mutant:
 # What of the suite is run first, by kernel file: the tests that know that file best, without slow ones.
 SUITES: dict[str, list[list[str]]] = {
     "blur.cl": [["tests/kernels/test_blur.py", "-k", "not full_hd and not 200 and not 120"]],
-    "frame.cl": [["tests/kernels/test_frame.py", "tests/test_renderer.py", "-k", "inverse or supersampling"]],
+    "frame.cl": [
+        ["tests/kernels/test_frame.py", "tests/test_renderer.py", "-k", "inverse or supersampling or middles"]
+    ],
     "frame.clh": [["tests/kernels/test_frame.py", "tests/planner/test_stats.py"]],
     "gather.cl": [["tests/kernels/test_gather.py", "tests/methods/test_gather.py"]],
     "layered.cl": [["tests/methods/test_layered.py"]],
@@ -116,6 +118,7 @@ MUTANTS: list[Mutant] = [
          "inverse_run(z + x, rgba + 4 * x, width - x + 1, nothing)"),
         ("weight", "1.0f / (float)(factor * factor)", "1.0f / (float)(factor)"),
         ("off by one", "for (int i = 0; i < factor; i++) sum", "for (int i = 1; i < factor; i++) sum"),
+        ("off by one", "((size_t)y * factor + factor / 2) * stride", "((size_t)y * factor + factor / 2 - 1) * stride"),
     ),
     *_rows(
         "frame.clh",
