@@ -56,6 +56,10 @@
 #ifndef MULTIVIEW_PARTS
 #define MULTIVIEW_PARTS 0
 #endif
+/* 1: rays are sent in the cells alone that are asked for. */
+#ifndef MULTIVIEW_SPARSE
+#define MULTIVIEW_SPARSE 0
+#endif
 
 /* Pixels of the peels for one of the image, along x and y. */
 #ifndef MULTIVIEW_SCALE
@@ -714,6 +718,8 @@ __kernel void multiview_finish(__global float *restrict image, const __global fl
  *         sets      int[cells_y][cells_x]
  *         ray_sets  int2[sets * STRIDE^2]  first ray and number of rays
  *         shifts    MultiviewShift[rays][layers]
+ *         gaps      ushort[cells_y][cells_x]  0 in cells that are asked for; with MULTIVIEW_SPARSE the others are left
+ *                   as they are
  * writes  image     float[output height][output width][4]; or, with MULTIVIEW_PARTS, adds to parts as multiview_finish
  *                   has them, or begins them with the `first` group
  * range   2-D, one item per MULTIVIEW_SPAN pixels of an output row, any local size */
@@ -732,11 +738,21 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
 #if MULTIVIEW_PARTS
                               , int first
 #endif
+#if MULTIVIEW_SPARSE
+                              , const __global ushort *restrict gaps
+#endif
 )
 {
     const int start = MULTIVIEW_SPAN * (int)get_global_id(0), y = (int)get_global_id(1) + guard;
     const int end_x = size.width - guard;
     if (start >= end_x || start + MULTIVIEW_SPAN <= guard || y >= size.height - guard) return;
+#if MULTIVIEW_SPARSE
+    const __global ushort *row_gaps = gaps + y / MULTIVIEW_CELL * size.cells_x;
+    int is_asked_for = 0;
+    for (int i = 0; i < MULTIVIEW_STRIDE; i++)
+        is_asked_for |= row_gaps[clamp_index(start / MULTIVIEW_CELL + i, size.cells_x - 1)] == 0;
+    if (!is_asked_for) return;
+#endif
     uint list = 0u;
     int set = 0;
     for (int i = 0; i < MULTIVIEW_STRIDE; i++) {
@@ -859,6 +875,9 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
             for (int j = 0; j < 4; j++) {
                 const int x = x0 + (4 * q + j) * MULTIVIEW_STRIDE;
                 if (x < guard || x >= end_x) continue;
+#if MULTIVIEW_SPARSE
+                if (row_gaps[x / MULTIVIEW_CELL] != 0) continue;
+#endif
 #if MULTIVIEW_VOID
                 const float past_all = clear[j];
 #else

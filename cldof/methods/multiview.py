@@ -64,6 +64,8 @@ MAX_RAYS = 1024
 _USUAL_DELTA_PX = 0.5
 # Growth around the focus rises on this grid, so that a lens in motion keeps to few pass lists.
 _STEPS_PER_OCTAVE = 8
+# Share of the work that few tiles leave: that of all but the rays.
+_TILES_FLOOR = 0.3
 # Layers without windows begin and end at multiples of this, for the same reason.
 _PLAIN_GRID = 4
 # Layers may not take more than this on the device; there are then fewer of them.
@@ -164,7 +166,7 @@ class Layering(NamedTuple):
         """Even layers that stand still in the scene: their number depends on the aperture, not on the focus.
 
         The ends of the range lie in the middle of layers: what is nearest or farthest is a facing surface more often
-        than what lies between.
+        than what lies between. A single layer is all of the range.
         """
         wanted = math.ceil(min((nearest - farthest) * abs(c1) / delta_px - 1e-6, float(most)))
         wanted = min(wanted + (wanted > 1), most)
@@ -172,7 +174,7 @@ class Layering(NamedTuple):
         octave = 1 << max(0, wanted - 1).bit_length()
         count = max(1, min(octave * 3 // 4 if octave >= 4 and wanted <= octave * 3 // 4 else octave, most))
         step = max((nearest - farthest) / max(count - 1, 1), 1e-9)  # kernels divide by it
-        anchor = nearest + step / 2.0
+        anchor = nearest + step / 2.0 if count > 1 else nearest
         inverse = (anchor - step * np.arange(count + 1)).astype(np.float32)
         return cls(inverse, c1, c0, anchor, step, step, 0.0, 0.0)
 
@@ -549,6 +551,7 @@ class Multiview:
             reach_px=lambda coc: coc + delta_px + cone + 2.0,
             leak=lambda coc: np.where(coc < still, 0.0, 1.0),
             counts_slopes=True,
+            tiles_floor=_TILES_FLOOR,
         )
 
     def program(self, shape: FrameShape, plan: Plan, traits: Traits) -> FrameProgram:
@@ -763,6 +766,7 @@ class _Builder:
             ("MULTIVIEW_PARTS", int(layers.eyes > 0)),
             ("MULTIVIEW_SCALE", factor),
             ("MULTIVIEW_REFINE", self.halvings),
+            ("MULTIVIEW_SPARSE", int(shape.is_sparse)),
         )
         self.color = "view" if layers.eyes else "color"
         self.peel_bytes = shape.layers * shape.height * shape.pitch * 4
@@ -776,6 +780,7 @@ class _Builder:
             Buffer("color", shape.layers * shape.height * shape.width * 16, Role.INPUT),
             Buffer("inv_depth", self.peel_bytes, Role.INPUT),
             Buffer("image", (self.width - 2 * self.guard) * (self.height - 2 * self.guard) * 16, Role.OUTPUT),
+            *((shape.gaps,) if shape.is_sparse else ()),
             Buffer("extent", self.peel_bytes),
             Buffer("nbuffer", self.levels * fine_bytes),
             Buffer("wanted", cell_bytes),
@@ -949,7 +954,7 @@ class _Builder:
             peels = tuple(read(name) for name in ("inv_depth", "extent", "places"))
             if self.halvings:
                 peels = (*peels, read("points"), *self.lens)
-        out = write("image")
+        out = (read_write if self.shape.is_sparse else write)("image")
         if self.layers.eyes:
             out = write("parts") if group == 0 else read_write("parts")
         self._add(
@@ -967,6 +972,7 @@ class _Builder:
                 self.size,
                 np.int32(self.guard),
                 *((np.int32(group == 0),) if self.layers.eyes else ()),
+                *((read("gaps"),) if self.shape.is_sparse else ()),
             ),
             (-(-self.width // (16 * self.stride)), height),
             height * width * 16 * (int(ranges[-1, 1]) + 1),

@@ -43,7 +43,7 @@ def test_windows_of_guard_bands_and_odd_sizes(pair: Pair, opaque: bool) -> None:
 
 
 # Methods that make single tiles of a frame.
-SPARSE = ("lightfield",)
+SPARSE = ("lightfield", "multiview")
 
 
 @pytest.mark.parametrize("guard", [0, 21])
