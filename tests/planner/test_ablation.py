@@ -66,6 +66,13 @@ def test_scattered_tiles(pair: Pair, far_m: float, guard: int) -> None:
     np.testing.assert_array_equal(planned[~is_made], frame.pinhole_image()[~is_made])
 
 
+@pytest.mark.parametrize("opaque", [True, False])
+def test_little_depth(pair: Pair, opaque: bool) -> None:
+    """All that there is fits into one layer, and what is in focus lies at its end."""
+    frame = wall_frame(260, 190, [(0, 0, 4, 4, 0.9)], opaque=opaque)
+    check(pair, frame, lens_for(frame, 0.3, 2.0))
+
+
 def test_all_in_focus(pair: Pair) -> None:
     frame = wall_frame(70, 50, [])
     plan = check(pair, frame, lens_for(frame, 9.0, 2.0))
