@@ -83,7 +83,7 @@ static inline LayeredLayer layered_layer(const __global LayeredMatting *matting,
 static inline float16 layered_breadth(const __global float *inv_depth, float16 w, LayeredSize size, LayeredLayer layer,
                                       int x, int y)
 {
-    return breadth_of(inv_depth, w, x, y, size.width, size.height, size.pitch, layer.around, 1.0f / layer.before.z);
+    return breadth_of(inv_depth, w, x, y, size.width, size.height, size.pitch, layer.around, layer.before.z);
 }
 
 /* Weights of 16 slots in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), with three changes.

@@ -172,44 +172,6 @@ __kernel void pyramid_flatten(__global float *restrict flat, __global float *res
     }
 }
 
-/* How much of two opposite slots belongs to the surface of the slot w between them, or hides it: all of what is nearer
- * or on a plane through the three, none of what is a whole interval (1 / scale) farther. That is what of a slot stands in
- * the sub-image before while w enters its own, and it changes evenly with depth: nothing may switch while focus moves. */
-static inline float16 shared_pair(float16 w, float16 a, float16 b, float scale)
-{
-    const float16 zero = (float16)(0.0f);
-    float16 a_nearer = a > w ? a - w : zero, b_nearer = b > w ? b - w : zero;
-    float16 of_a = clamp01(1.0f - (w - a - b_nearer) * scale), of_b = clamp01(1.0f - (w - b - a_nearer) * scale);
-    return (a >= 0.0f ? of_a : zero) + (b >= 0.0f ? of_b : zero);
-}
-
-/* Slots from (x, y) on; beyond the frame surfaces go on as they are at the slots w. */
-static inline float16 slots_around(const __global float *inv_depth, float16 w, int x, int y, PyramidSize size)
-{
-    if (y < 0 || y >= size.height) return w;
-    const __global float *row = inv_depth + (size_t)y * size.pitch;
-    if (x >= 0 && x + 16 <= size.width) return load_quad(row + x);
-    float v[16];
-    *(float16_unaligned *)v = w;
-    for (int i = 0; i < 16; i++) v[i] = x + i >= 0 && x + i < size.width ? row[x + i] : v[i];
-    return *(const float16_unaligned *)v;
-}
-
-/* The same as shared_pair of eight slots `far` pixels away from each of the 16 slots w from pixel (x, y) on, a share. */
-static inline float16 ring_of(const __global float *inv, float16 w, int x, int y, PyramidSize size, int far,
-                              float scale)
-{
-    const int near = far * 7 / 10 > 1 ? far * 7 / 10 : 1;
-    float16 found =
-        shared_pair(w, slots_around(inv, w, x - far, y, size), slots_around(inv, w, x + far, y, size), scale);
-    found += shared_pair(w, slots_around(inv, w, x, y - far, size), slots_around(inv, w, x, y + far, size), scale);
-    found += shared_pair(w, slots_around(inv, w, x - near, y - near, size),
-                         slots_around(inv, w, x + near, y + near, size), scale);
-    found += shared_pair(w, slots_around(inv, w, x + near, y - near, size),
-                         slots_around(inv, w, x - near, y + near, size), scale);
-    return found * 0.125f;
-}
-
 /* pyramid_slope: change of inverse depth from one pixel to the next, the lesser of both sides, so that a silhouette
  * does not count as a slope, and the greater of both directions; and how much of a visible surface is left around it
  * when it is blurred.
@@ -243,9 +205,9 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
             float16 rest = w * before.x + before.y;
             int16 is_own = (rest > 0.0f) & (rest <= 1.0f) & (w >= 0.0f);
             if (sum16(is_own ? (float16)(1.0f) : (float16)(0.0f)) == 0.0f) continue;
-            const int around = matting->around[i];
-            float16 near = ring_of(flat_inv, w, x, y, size, around, before.x);
-            float16 far = ring_of(flat_inv, w, x, y, size, 2 * around, before.x);
+            const int around = matting->around[i], width = size.width, height = size.height, pitch = size.pitch;
+            float16 near = breadth_of(flat_inv, w, x, y, width, height, pitch, around, before.x);
+            float16 far = breadth_of(flat_inv, w, x, y, width, height, pitch, 2 * around, before.x);
             near = 1.0f - PYRAMID_NEAR_RING * (1.0f - near) - PYRAMID_FAR_RING * (1.0f - far);
             share = is_own ? near : share;
         }

@@ -58,11 +58,13 @@ def breadth(coc: np.ndarray, radius: int, step: float) -> np.ndarray:
     near = max(1, radius * 7 // 10)
     found = np.zeros(coc.shape)
     for dx, dy in ((radius, 0), (0, radius), (near, near), (-near, near)):
-        a = coc[np.clip(y - dy, 0, height - 1), np.clip(x - dx, 0, width - 1)]
-        b = coc[np.clip(y + dy, 0, height - 1), np.clip(x + dx, 0, width - 1)]
-        with np.errstate(invalid="ignore"):
-            found += a <= coc + np.fmax(coc - b, 0) + step
-            found += b <= coc + np.fmax(coc - a, 0) + step
+        ends = []
+        for row, column in ((y - dy, x - dx), (y + dy, x + dx)):
+            inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+            end = coc[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+            ends.append(np.where(inside, end, coc - step))  # beyond the frame surfaces go on, and may slope
+        for end, opposite in (ends, ends[::-1]):  # all of what lies on a plane, none of what is a step farther
+            found += np.nan_to_num(np.clip(1.0 - (end - coc - np.fmax(coc - opposite, 0.0)) / step, 0.0, 1.0))
     return found / 8
 
 

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from tests.oracles.layered import breadth
+
 # Inverse depth where there is nothing, or a hole.
 EMPTY = -1.0
 
@@ -178,28 +180,6 @@ def paper_matting(i: int, first: int, last: int, z: Callable[[int], float]) -> M
     return Matting(rise, fall, ones)
 
 
-def breadth(blur: np.ndarray, around: int, interval: float) -> np.ndarray:
-    """Share of the weight around each pixel that belongs to its surface or hides it, (H, W): two rings."""
-
-    def ring(far: int) -> np.ndarray:
-        height, width = blur.shape
-        y, x = np.mgrid[:height, :width]
-        near = max(1, far * 7 // 10)
-        shares = []
-        for dx, dy in ((far, 0), (0, far), (near, near), (-near, near)):
-            ends = []
-            for row, column in ((y - dy, x - dx), (y + dy, x + dx)):
-                inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-                end = blur[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-                ends.append(np.where(inside, end, blur))  # beyond the frame surfaces go on
-            for end, opposite in (ends, ends[::-1]):
-                plane = np.fmax(blur - opposite, 0.0)  # by so much it may be farther than the pixel
-                shares.append(np.nan_to_num(np.clip(1.0 - (end - blur - plane) / interval, 0.0, 1.0)))
-        return np.mean(shares, axis=0)
-
-    return 0.05 + 0.6 * ring(around) + 0.35 * ring(2 * around)
-
-
 def seamless_matting(
     i: int, first: int, last: int, radius: Callable[[int], float], c1: float, c0: float, sigma: Callable[[int], float]
 ) -> Matting:
@@ -230,7 +210,8 @@ def seamless_matting(
             near, far = radius(j - 1), radius(j)
             around = max(1, math.ceil(max(sigma(j), sigma(j - 1))))
             own = (blur >= near) & (blur < far)
-            result = np.where(own, breadth(blur, around, far - near), result)
+            rings = 0.6 * breadth(blur, around, far - near) + 0.35 * breadth(blur, 2 * around, far - near)
+            result = np.where(own, 0.05 + rings, result)
         return result
 
     def fall(inverse: np.ndarray) -> np.ndarray:

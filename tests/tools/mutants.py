@@ -146,7 +146,9 @@ MUTANTS: list[Mutant] = [
         ("clamp", "to_a = a < 0.0f || to_a > silhouette ?", "to_a = a < 0.0f ?"),
         ("off by one", "float16 left = x > 0 ? load_quad(inv - 1)", "float16 left = x > 0 ? load_quad(inv - 2)"),
         ("compare", "return across > down ? across : down;", "return across < down ? across : down;"),
-        ("swap", "load_quad(top + x), load_quad(bottom + x)", "load_quad(top + x), load_quad(top + x)"),
+        ("sign", "x + dx[i], y + dy[i],", "x + dx[i], y - dy[i],"),
+        ("drop", "const float16 beyond = w + 1.0f / scale;", "const float16 beyond = w;"),
+        ("weight", "clamp01(1.0f - (w - a - b_nearer) * scale)", "clamp01(1.0f - (w - a - b_nearer) * 4.0f * scale)"),
         ("weight", "return found * 0.125f;", "return found * 0.25f;"),
     ),
     *_rows(
