@@ -469,7 +469,6 @@ class Renderer:
                 self._rings.clear()
                 self._frames.clear()
                 self._finer.clear()
-                self._finer.clear()
                 self.device.close()  # with all of its memory
 
     def __enter__(self) -> Renderer:

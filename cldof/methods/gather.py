@@ -2,11 +2,10 @@
 
 One RGBZ image (all peels composed), no hidden surfaces. It looks at whole pixels that stand still while the lens
 moves: at all of a narrow blur, at fewer and fewer of a wider one, each fading in and out, so that the image never
-jumps. With ``kernel="disc"`` those in front of the pixel that are
-too sharp to reach it are left out, so what is in focus does not bleed into what is blurred behind it. A pixel in focus
-gathers only from itself, so what is blurred in front of it keeps a hard edge: gathering cannot do better, and the other
-methods are there for it. ``kernel="gaussian"`` is the image-space blur that people write first: it looks at no depth
-but the pixel's own.
+jumps. With ``kernel="disc"`` those in front of the pixel that are too sharp to reach it are left out, so what is in
+focus does not bleed into what is blurred behind it. A pixel in focus gathers only from itself, so what is blurred in
+front of it keeps a hard edge: gathering cannot do better, and the other methods are there for it. ``kernel="gaussian"``
+is the image-space blur that people write first: it looks at no depth but the pixel's own.
 """
 
 from __future__ import annotations
