@@ -93,7 +93,7 @@ def rack_lenses(scene: Scene, look: LayeredFrame, frames: int) -> list[Lens]:
 
 def _capture(peeler: DepthPeeler, scene: Scene, camera: Camera, look: LayeredFrame, lenses: list[Lens]) -> LayeredFrame:
     """Layers with a guard band for the largest blur of all lenses."""
-    ends = [look.inverse_depth_range[0] if look.is_opaque else 0.0, look.inverse_depth_range[1]]
+    ends = look.shown_inverse_depths
     coc = [abs(c1 * end + c0) for c1, c0 in (lens.coc_coefficients(camera) for lens in lenses) for end in ends]
     widest = max(lenses, key=lambda lens: lens.aperture_radius_m)
     return peeler.peel(scene, camera, layers=_PEELS, lens=widest, guard_px=math.ceil(max(coc)))

@@ -228,6 +228,12 @@ class LayeredFrame:
         farthest = float(self.depth.max(initial=0.0, where=finite))
         return (0.0 if sky else 1.0 / farthest), 1.0 / nearest
 
+    @property
+    def shown_inverse_depths(self) -> tuple[float, float]:
+        """Smallest and largest ``1/z`` (1/m) of what the image shows, where the void is a surface at infinity."""
+        farthest, nearest = self.inverse_depth_range
+        return farthest if self.is_opaque else 0.0, nearest
+
     @cached_property
     def farthest_opaque(self) -> NDArray[np.float32]:
         """Inverse depth (1/m) of the farthest opaque slot of each pixel, (H, W); inf where there is none."""

@@ -80,9 +80,7 @@ class Gather:
     def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
         """Nothing to decide: the passes are the same for all lenses."""
         c1, c0 = lens.coc_coefficients(frame.camera)
-        farthest, nearest = frame.inverse_depth_range
-        if not frame.is_opaque:
-            farthest = 0.0  # the void is a surface at infinity
+        farthest, nearest = frame.shown_inverse_depths
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},

@@ -181,9 +181,7 @@ class Layered:
 
     def _plan(self, frame: LayeredFrame, lens: Lens, both_sides: bool) -> Plan:
         c1, c0 = lens.coc_coefficients(frame.camera)
-        farthest, nearest = frame.inverse_depth_range
-        if not frame.is_opaque:
-            farthest = 0.0  # the void is a surface at infinity
+        farthest, nearest = frame.shown_inverse_depths
         near_px, far_px = max(0.0, -(c1 * nearest + c0)), max(0.0, c1 * farthest + c0)
         widest_px = _WIDEST_SIDES * max(frame.width, frame.height)
         stack = self._stack(min(near_px, widest_px), min(far_px, widest_px))

@@ -165,9 +165,7 @@ class LightField:
     def plan(self, frame: LayeredFrame, lens: Lens) -> Plan:
         """Choose the number of views and mip levels from the CoC range."""
         c1, c0 = lens.coc_coefficients(frame.camera)
-        farthest, nearest = frame.inverse_depth_range
-        if not frame.is_opaque:
-            farthest = 0.0  # the void is a surface at infinity
+        farthest, nearest = frame.shown_inverse_depths
         largest = max(abs(c1 * farthest + c0), abs(c1 * nearest + c0))
         is_shaded = self.view_dependent and frame.is_glossy_through(lens)
         count = self.views if largest >= _NEGLIGIBLE_COC_PX or is_shaded else 1

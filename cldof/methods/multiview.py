@@ -475,7 +475,7 @@ class Multiview:
             places[name][: len(values)] = values
         plain = _plain([w is None for w in windows])
         structure = LensLayers(where.total, lens.aperture, plain, eyes, halvings, where.refined)
-        farthest, nearest = _inverse_depths(frame)
+        farthest, nearest = frame.shown_inverse_depths
         summary = {
             "method": self.name,
             **{field.name: getattr(self, field.name) for field in fields(self)},
@@ -504,7 +504,7 @@ class Multiview:
     def layering(self, frame: LayeredFrame, lens: Lens) -> Layering:
         """Where the layers of a frame are through a lens."""
         c1, c0 = (value / self.supersample for value in lens.coc_coefficients(frame.camera))
-        farthest, nearest = _inverse_depths(frame)
+        farthest, nearest = frame.shown_inverse_depths
         shape = FrameShape.of(frame)
         most = self.layers
         if self.traversal == "layers":
@@ -660,12 +660,6 @@ def _matched_scale(coc: float, aperture: Aperture, antialias: bool) -> float:
     wanted = coc**2 * points.var(axis=0).mean() + (0.0 if antialias else -1.0 / 12.0)
     found = _variance(points, coc * tries, turning=True)
     return float(tries[np.abs(found - wanted).argmin()])
-
-
-def _inverse_depths(frame: LayeredFrame) -> tuple[float, float]:
-    """Least and greatest inverse depth of what a frame shows, 1/m; the void is a surface at infinity."""
-    farthest, nearest = frame.inverse_depth_range
-    return farthest if frame.is_opaque else 0.0, nearest
 
 
 @lru_cache(32)

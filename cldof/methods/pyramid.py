@@ -176,9 +176,7 @@ class Pyramid:
 
     def _plan(self, frame: LayeredFrame, lens: Lens, both_sides: bool) -> Plan:
         c1, c0 = lens.coc_coefficients(frame.camera)
-        farthest, nearest = frame.inverse_depth_range
-        if not frame.is_opaque:
-            farthest = 0.0  # the void is a surface at infinity
+        farthest, nearest = frame.shown_inverse_depths
         near_px = max(0.0, -GAUSSIAN_SIGMA * (c1 * nearest + c0))
         far_px = max(0.0, GAUSSIAN_SIGMA * (c1 * farthest + c0))
         chosen, last = self._choose(near_px, far_px, GAUSSIAN_SIGMA * c0, max(frame.width, frame.height))
