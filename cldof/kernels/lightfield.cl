@@ -430,7 +430,7 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
 #endif
             /* The void behind a surface is the same for every peel; what is behind glass at infinity is not void. */
             if (m > 0 && depth == 0.0f && inv_depth[row - peel + x] == 0.0f
-                && !(LIGHTFIELD_GLASS && is_glass(color, size, m - 1, x, y)))
+                && !(LIGHTFIELD_GLASS > 0 && is_glass(color, size, m - 1, x, y)))
                 continue;
             const float coc = ((const float *)&c)[i];
             const size_t to = row + count++;
@@ -664,7 +664,7 @@ static inline int is_similar(float other, float w, float c, LightfieldLens lens)
 /* Glass and what is not are never mixed: an opaque surface would let light through. */
 static inline int is_same_kind(float4 a, float4 b)
 {
-    return !LIGHTFIELD_GLASS || (a.w >= OPAQUE_ALPHA) == (b.w >= OPAQUE_ALPHA);
+    return LIGHTFIELD_GLASS == 0 || (a.w >= OPAQUE_ALPHA) == (b.w >= OPAQUE_ALPHA);
 }
 
 /* Colour of a ray between pixels that may belong to several surfaces: bilinear, with those of another surface replaced
