@@ -178,37 +178,40 @@ def judge_times(device: Any, busy: bool, unit_ms: float, scenes: tuple[str, ...]
         "| max_ms, copies | attainable | kept, first choice | kept, after 10 frames | mean share of the time used |",
         "|---|---|---|---|---|",
     ]
-    shots: list[tuple[LayeredFrame, Lens]] = []
-    with DepthPeeler() as peeler:
-        for name in scenes:
-            scene = builtin_scenes()[name].make()
-            camera = scene.camera_for(LARGE, LARGE)
-            look = peeler.peel(scene, scene.camera_for(LOOK, LOOK), layers=2)
-            lens = judged_lenses(scene, look)[(2, 9)[len(shots) % 2]]
-            shots.append((capture(peeler, scene, camera, lens, look), lens))
-    quickest = [min(_setting_ms(device, one, frame, lens, busy) for one in LADDER[:4]) for frame, lens in shots]
-    for copies in BUDGETS_COPIES:
-        budget = copies * unit_ms
-        first, later, used = [], [], []
-        for (frame, lens), least in zip(shots, quickest, strict=True):
-            if least > budget:
-                continue
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", BudgetWarning)
-                with Renderer("auto", device=device, max_ms=budget) as renderer:
-                    setting = renderer.render(frame, lens).choice.setting
-                    first.append(_setting_ms(device, setting, frame, lens, busy) <= budget)
-                    for _ in range(9):
+    with DepthPeeler() as peeler:  # open as long as frames may ask for finer ones
+        shots = list(_shots(peeler, scenes))
+        quickest = [min(_setting_ms(device, one, frame, lens, busy) for one in LADDER[:4]) for frame, lens in shots]
+        for copies in BUDGETS_COPIES:
+            budget = copies * unit_ms
+            first, later, used = [], [], []
+            for (frame, lens), least in zip(shots, quickest, strict=True):
+                if least > budget:
+                    continue
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", BudgetWarning)
+                    with Renderer("auto", device=device, max_ms=budget) as renderer:
                         setting = renderer.render(frame, lens).choice.setting
-            took = _setting_ms(device, setting, frame, lens, busy)
-            later.append(took <= budget)
-            used.append(took / budget)
-        if first:
-            lines.append(
-                f"| {copies} ({budget:.1f} ms) | {len(first)} of {len(shots)} | {np.mean(first):.0%} | "
-                f"{np.mean(later):.0%} | {np.mean(used):.0%} |"
-            )
+                        first.append(_setting_ms(device, setting, frame, lens, busy) <= budget)
+                        for _ in range(9):
+                            setting = renderer.render(frame, lens).choice.setting
+                took = _setting_ms(device, setting, frame, lens, busy)
+                later.append(took <= budget)
+                used.append(took / budget)
+            if first:
+                lines.append(
+                    f"| {copies} ({budget:.1f} ms) | {len(first)} of {len(shots)} | {np.mean(first):.0%} | "
+                    f"{np.mean(later):.0%} | {np.mean(used):.0%} |"
+                )
     return lines
+
+
+def _shots(peeler: DepthPeeler, scenes: tuple[str, ...]) -> Iterator[tuple[LayeredFrame, Lens]]:
+    """Every scene, large, through one of its lenses."""
+    for number, name in enumerate(scenes):
+        scene = builtin_scenes()[name].make()
+        look = peeler.peel(scene, scene.camera_for(LOOK, LOOK), layers=2)
+        lens = judged_lenses(scene, look)[(2, 9)[number % 2]]
+        yield capture(peeler, scene, scene.camera_for(LARGE, LARGE), lens, look), lens
 
 
 def _setting_ms(device: Any, setting: Setting, frame: LayeredFrame, lens: Lens, busy: bool) -> float:

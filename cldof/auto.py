@@ -518,7 +518,7 @@ def curves_name(device: str, driver: str) -> str:
 # How sure it is to keep an error is weighed against time: certainty is worth so many times the quickest setting's time,
 # the least of these by which so large a share of the measured cases is kept, each judged by models of all others. Their
 # lenses open up to twice as wide as scenes suggest; of ordinary ones 95 % and more are kept then.
-_WORTHS, _KEPT = tuple(20.0 * math.pow(2.0, step / 2.0) for step in range(11)), 0.915
+_WORTHS, _KEPT = tuple(20.0 * math.pow(2.0, step / 2.0) for step in range(11)), 0.93
 # Nothing that is less likely than this to keep an error is taken while something else is.
 _LIKELY = 0.5
 # Where no setting is likelier than this to keep an error, the one that comes nearest is taken.
