@@ -1067,7 +1067,7 @@ def stats_passes(shape: FrameShape, is_cpu: bool) -> tuple[list[Buffer], list[Pa
 
     Their parameters are those of :func:`stats_params`.
     """
-    tiles_x, tiles_y = -(-shape.width // TILE), -(-shape.height // TILE)
+    tiles_y, tiles_x = shape.tiles
     size = struct_scalar(_SIZE, shape.width, shape.height, shape.pitch, shape.layers, tiles_x, tiles_y)
     bins = (Param("first_bin", _FLOAT), Param("bin_scale", _FLOAT))
     slots = shape.layers * shape.height * shape.width
@@ -1108,7 +1108,7 @@ def read_stats(
     first, scale : float
         As the passes got them.
     """
-    tiles_x, tiles_y = -(-shape.width // TILE), -(-shape.height // TILE)
+    tiles_y, tiles_x = shape.tiles
     records = tiles.view(_TILE_STATS).reshape(shape.layers, tiles_y, tiles_x)
     slots = records["slots"].copy()
     is_empty = slots == 0.0
@@ -1138,7 +1138,7 @@ def read_stats(
 
 def buffer_sizes(shape: FrameShape) -> Mapping[str, tuple[int, type]]:
     """Elements and dtype of the two buffers, to read them back."""
-    tiles_x, tiles_y = -(-shape.width // TILE), -(-shape.height // TILE)
+    tiles_y, tiles_x = shape.tiles
     return {
         "tiles": (shape.layers * tiles_y * tiles_x * _TILE_STATS.itemsize, np.uint8),
         "histogram": (shape.layers * tiles_y * BINS, np.int32),

@@ -64,10 +64,10 @@ MAX_RAYS = 1024
 _USUAL_DELTA_PX = 0.5
 # Growth around the focus rises on this grid, so that a lens in motion keeps to few pass lists.
 _STEPS_PER_OCTAVE = 8
-# Share of the work that few tiles leave: that of all but the rays.
-_TILES_FLOOR = 0.3
 # Layers without windows begin and end at multiples of this, for the same reason.
 _PLAIN_GRID = 4
+# Share of the work that few tiles leave: that of all but the rays.
+_TILES_FLOOR = 0.3
 # Layers may not take more than this on the device; there are then fewer of them.
 _LAYER_BYTES = 1 << 30
 _FEWEST_LAYERS = 5
