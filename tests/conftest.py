@@ -2,7 +2,8 @@
 
 ``device`` runs a test once per OpenCL device of the machine, ``out_of_order_device`` the same on queues that reorder.
 Their pools surround every buffer with canaries, fill it with NaN, and are checked after every test: a kernel that
-writes outside its buffers, or counts on zeros, fails here without any effort in the test.
+writes outside its buffers, or counts on zeros, fails here without any effort in the test. ``CLDOF_TEST_LANES=4`` builds
+their kernels for vectors of another width than the device's.
 """
 
 from __future__ import annotations
@@ -140,6 +141,8 @@ class DeviceOpener:
 
     def __call__(self, info: DeviceInfo, **options: Any) -> Device:
         """Like ``Device.open(info.index, ...)``, with pass signatures checked."""
+        if width := os.environ.get("CLDOF_TEST_LANES"):
+            options.setdefault("lanes", int(width))
         device = Device.open(info.index, check_signatures=True, **options)
         self.opened.append(device)
         device.pool = CanaryPool(device.context, device.queue, shares_memory=device.pool.shares_memory)

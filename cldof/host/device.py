@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..errors import DeviceError
 from . import opencl as cl
 from .buffers import BufferPool
+from .lanes import LANES, PROBE_SOURCE, lanes_for
 from .launch import launch
 from .program import ProgramCache, SourceDirectory
 from .quirks import Effect, effects_of
@@ -113,6 +114,8 @@ class Traits:
         ``atom_min`` on ulong works: claimed, built and run with the right result.
     has_long_loops : bool
         The loops of a work-item may take more than 65535 turns. Found by running one that does.
+    lanes : int
+        Floats that a work-item of the kernels computes with at a time; see :mod:`cldof.host.lanes`.
     """
 
     is_cpu: bool
@@ -129,6 +132,7 @@ class Traits:
     supports_out_of_order: bool
     has_int64_atomics: bool
     has_long_loops: bool
+    lanes: int
 
 
 def list_devices() -> list[DeviceInfo]:
@@ -172,7 +176,10 @@ class Device:
         owned: bool = True,
         sources: SourceDirectory | None = None,
         check_signatures: bool = False,
+        lanes: int | None = None,
     ) -> None:
+        if lanes is not None and lanes not in LANES:
+            raise DeviceError(f"kernels can be built for {', '.join(map(str, LANES))} lanes, not for {lanes!r}")
         self.context = context
         self.queue = queue
         self.check_signatures = check_signatures
@@ -182,10 +189,15 @@ class Device:
         properties = queue.properties
         self.is_out_of_order = bool(properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE)
         self.is_profiling = bool(properties & cl.command_queue_properties.PROFILING_ENABLE)
-        self.programs = ProgramCache(
-            context, self._cl_device, sources or files("cldof.kernels"), from_source=check_signatures
-        )
         self.pool = BufferPool(context, queue, shares_memory=_shares_memory(self._cl_device))
+        self._lanes = lanes
+        self.programs = ProgramCache(
+            context,
+            self._cl_device,
+            sources or files("cldof.kernels"),
+            defines=lambda: (("LANES", self.lanes),),
+            from_source=check_signatures,
+        )
 
     @classmethod
     def open(
@@ -196,6 +208,7 @@ class Device:
         out_of_order: bool = False,
         sources: SourceDirectory | None = None,
         check_signatures: bool = False,
+        lanes: int | None = None,
     ) -> Device:
         """Open a device.
 
@@ -213,6 +226,8 @@ class Device:
             Kernel files other than the library's own.
         check_signatures : bool
             See the attribute.
+        lanes : int, optional
+            Build kernels for that width in place of the one that suits the device: 4, 8 or 16.
 
         Raises
         ------
@@ -234,7 +249,7 @@ class Device:
             queue = _new_queue(context, device, profiling, out_of_order)
         except cl.Error as error:
             raise DeviceError(f"device {infos[index]} cannot be opened: {error}. Choose another one.") from error
-        return cls(context, queue, index=index, sources=sources, check_signatures=check_signatures)
+        return cls(context, queue, index=index, sources=sources, check_signatures=check_signatures, lanes=lanes)
 
     @classmethod
     def adopt(
@@ -284,7 +299,17 @@ class Device:
             supports_out_of_order=_supports_out_of_order(device),
             has_int64_atomics=self._int64_atomics_work(),
             has_long_loops=self._long_loops_work(),
+            lanes=self.lanes,
         )
+
+    @cached_property
+    def lanes(self) -> int:
+        """Floats that a work-item computes with at a time; the first look runs a tiny kernel on CPUs."""
+        if self._lanes is not None:
+            return self._lanes
+        is_cpu = self.info.kind == "cpu"
+        found = self._probed(PROBE_SOURCE, np.zeros(1, np.uint32), 1) if is_cpu else None
+        return lanes_for(is_cpu, 0 if found is None else int(found[0]), self._cl_device.native_vector_width_float)
 
     def finish(self) -> None:
         """Block until everything enqueued is done."""

@@ -11,7 +11,7 @@ import hashlib
 import math
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Lock
@@ -101,6 +101,8 @@ class ProgramCache:
         Where the ``.cl`` and ``.clh`` files are.
     cache_dir : Path, optional
         Of the disk cache; :func:`default_cache_dir` unless told otherwise.
+    defines : callable
+        Called before the first build; compile-time constants of all programs, unless a program's own say otherwise.
     from_source : bool
         Never load binaries: on some drivers a program from a binary has no argument info.
     """
@@ -112,11 +114,13 @@ class ProgramCache:
         directory: SourceDirectory,
         cache_dir: Path | None = None,
         *,
+        defines: Callable[[], Defines] = tuple,
         from_source: bool = False,
     ) -> None:
         self._context = context
         self._device = device
         self._directory = directory
+        self._defines = defines
         self._programs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._lock = Lock()
         effects = effects_of(device.platform.name, device.name)
@@ -150,6 +154,8 @@ class ProgramCache:
 
     def program(self, stem: str, defines: Defines = ()) -> Any:
         """The built program of ``<stem>.cl`` with those defines."""
+        own = {name for name, _ in defines}
+        defines = (*(one for one in self._defines() if one[0] not in own), *defines)
         # By text, since 1, 1.0 and True are the same key but not the same define.
         key = (stem, _define_lines(defines))
         with self._lock:

@@ -23,21 +23,21 @@ __kernel void blur_fir(__global float *restrict out, const __global float *restr
     const int y0 = (int)get_group_id(1) * FIR_ROWS;
     const __global float *centre = taps + FIR_PAD + radius;
 
-    for (int b = get_local_id(0); b < line_width / 4; b += get_local_size(0)) {
-        int x = x0 - halo + 4 * b;
+    for (int b = get_local_id(0); b < line_width / PIXELS; b += get_local_size(0)) {
+        int x = x0 - halo + PIXELS * b;
         if (x < 0 || x >= width) continue;
-        float16 acc[FIR_ROWS];
+        floatn acc[FIR_ROWS];
         fir_columns(acc, image, x, y0, height, pitch, centre, radius);
 #pragma unroll
-        for (int i = 0; i < FIR_ROWS; i++) store_quad_local(lines + (i * line_width + 4 * b) * 4, acc[i]);
+        for (int i = 0; i < FIR_ROWS; i++) store_lanes_local(lines + (i * line_width + PIXELS * b) * 4, acc[i]);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     fir_extend_lines(lines, line_width, x0 - halo, width);
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (int b = get_local_id(0); b < segment / 8; b += get_local_size(0)) {
-        int x = x0 + 8 * b;
+    for (int b = get_local_id(0); b < segment / (2 * PIXELS); b += get_local_size(0)) {
+        int x = x0 + 2 * PIXELS * b;
         if (x < pitch)
-            fir_store_pair(out, lines, line_width, 8 * b + halo, x, y0, height, pitch, centre, radius);
+            fir_store_pair(out, lines, line_width, 2 * PIXELS * b + halo, x, y0, height, pitch, centre, radius);
     }
 }
 
@@ -61,12 +61,12 @@ typedef struct {
 } IirSection;
 
 typedef struct {
-    float16 re[IIR_SECTIONS], im[IIR_SECTIONS];
+    floatn re[IIR_SECTIONS], im[IIR_SECTIONS];
 } IirState;
 
-static inline float16 not_negative(float16 v) { return v > 0.0f ? v : (float16)(0.0f); }
+static inline floatn not_negative(floatn v) { return v > 0.0f ? v : (floatn)(0.0f); }
 
-static inline void iir_rest(IirState *s, const __global IirSection *k, float16 x)
+static inline void iir_rest(IirState *s, const __global IirSection *k, floatn x)
 {
 #pragma unroll
     for (int i = 0; i < IIR_SECTIONS; i++) {
@@ -76,29 +76,29 @@ static inline void iir_rest(IirState *s, const __global IirSection *k, float16 x
 }
 
 /* s = p*s + x */
-static inline void iir_advance(IirState *s, const __global IirSection *k, float16 x)
+static inline void iir_advance(IirState *s, const __global IirSection *k, floatn x)
 {
 #pragma unroll
     for (int i = 0; i < IIR_SECTIONS; i++) {
-        float16 re = k[i].pole_re * s->re[i] + (x - k[i].pole_im * s->im[i]);
+        floatn re = k[i].pole_re * s->re[i] + (x - k[i].pole_im * s->im[i]);
         s->im[i] = k[i].pole_re * s->im[i] + k[i].pole_im * s->re[i];
         s->re[i] = re;
     }
 }
 
 /* Re(c * s) */
-static inline float16 iir_output(const IirState *s, const __global IirSection *k)
+static inline floatn iir_output(const IirState *s, const __global IirSection *k)
 {
-    float16 y = (float16)(0.0f);
+    floatn y = (floatn)(0.0f);
 #pragma unroll
     for (int i = 0; i < IIR_SECTIONS; i++) y += k[i].gain_re * s->re[i] - k[i].gain_im * s->im[i];
     return y;
 }
 
 /* Re(c * p * s): the state one step on, before the new sample joins it. */
-static inline float16 iir_output_past(const IirState *s, const __global IirSection *k)
+static inline floatn iir_output_past(const IirState *s, const __global IirSection *k)
 {
-    float16 y = (float16)(0.0f);
+    floatn y = (floatn)(0.0f);
 #pragma unroll
     for (int i = 0; i < IIR_SECTIONS; i++) {
         float a = k[i].gain_re * k[i].pole_re - k[i].gain_im * k[i].pole_im;
@@ -112,49 +112,56 @@ static inline float16 iir_output_past(const IirState *s, const __global IirSecti
  * reads   image     float[height][pitch][4]
  *         sections  IirSection[IIR_SECTIONS]
  * writes  out       float[height][pitch][4], not image
- * range   1-D, one item per quad of a row, any local size */
+ * range   1-D, one item per PIXELS pixels of a row, any local size */
 __kernel void blur_iir_columns(__global float *restrict out, const __global float *restrict image,
                                const __global IirSection *restrict sections, int width, int height, int pitch)
 {
-    const int x = 4 * (int)get_global_id(0);
+    const int x = PIXELS * (int)get_global_id(0);
     const size_t stride = (size_t)pitch * 4;
     if (x >= width) return;
     const __global float *from = image + x * 4;
     __global float *to = out + x * 4;
     IirState s;
-    iir_rest(&s, sections, load_quad(from));
+    iir_rest(&s, sections, load_lanes(from));
     for (int y = 0; y < height; y++) {
-        iir_advance(&s, sections, load_quad(from + y * stride));
-        store_quad(to + y * stride, iir_output(&s, sections));
+        iir_advance(&s, sections, load_lanes(from + y * stride));
+        store_lanes(to + y * stride, iir_output(&s, sections));
     }
-    iir_rest(&s, sections, load_quad(from + (height - 1) * stride));
+    iir_rest(&s, sections, load_lanes(from + (height - 1) * stride));
     for (int y = height - 1; y >= 0; y--) {
-        store_quad(to + y * stride, not_negative(load_quad(to + y * stride) + iir_output_past(&s, sections)));
-        iir_advance(&s, sections, load_quad(from + y * stride));
+        store_lanes(to + y * stride, not_negative(load_lanes(to + y * stride) + iir_output_past(&s, sections)));
+        iir_advance(&s, sections, load_lanes(from + y * stride));
     }
 }
 
-/* Pixel x of four rows. Rows past the last repeat it, so that no lane holds garbage. */
-static inline float16 load_rows(const __global float *const row[4], int x)
+/* Pixel x of PIXELS rows. Rows past the last repeat it, so that no lane holds garbage. */
+static inline floatn load_rows(const __global float *const row[PIXELS], int x)
 {
-    return (float16)(load_pixel(row[0] + x * 4), load_pixel(row[1] + x * 4), load_pixel(row[2] + x * 4),
-                     load_pixel(row[3] + x * 4));
+#define ROW(i) load_pixel(row[i] + x * 4)
+    return PIXELS_OF(ROW);
+#undef ROW
 }
 
-/* blur_iir_rows: recursive Gaussian along the rows, four rows an item.
+static inline void store_rows(__global float *const row[PIXELS], int x, floatn v)
+{
+#pragma unroll
+    for (int i = 0; i < PIXELS; i++) store_pixel(row[i] + x * 4, pixel_of(v, i));
+}
+
+/* blur_iir_rows: recursive Gaussian along the rows, PIXELS rows an item.
  * reads   image     float[height][pitch][4]
  *         sections  IirSection[IIR_SECTIONS]
  * writes  out       float[height][pitch][4], not image
- * range   1-D, one item per four rows, any local size */
+ * range   1-D, one item per PIXELS rows, any local size */
 __kernel void blur_iir_rows(__global float *restrict out, const __global float *restrict image,
                             const __global IirSection *restrict sections, int width, int height, int pitch)
 {
-    const int y = 4 * (int)get_global_id(0);
+    const int y = PIXELS * (int)get_global_id(0);
     if (y >= height) return;
-    const __global float *from[4];
-    __global float *to[4];
+    const __global float *from[PIXELS];
+    __global float *to[PIXELS];
 #pragma unroll
-    for (int i = 0; i < 4; i++) {
+    for (int i = 0; i < PIXELS; i++) {
         size_t offset = (size_t)clamp_index(y + i, height - 1) * pitch * 4;
         from[i] = image + offset;
         to[i] = out + offset;
@@ -163,22 +170,13 @@ __kernel void blur_iir_rows(__global float *restrict out, const __global float *
     iir_rest(&s, sections, load_rows(from, 0));
     for (int x = 0; x < width; x++) {
         iir_advance(&s, sections, load_rows(from, x));
-        float16 v = iir_output(&s, sections);
-        store_pixel(to[0] + x * 4, v.s0123);
-        store_pixel(to[1] + x * 4, v.s4567);
-        store_pixel(to[2] + x * 4, v.s89ab);
-        store_pixel(to[3] + x * 4, v.scdef);
+        store_rows(to, x, iir_output(&s, sections));
     }
     iir_rest(&s, sections, load_rows(from, width - 1));
     for (int x = width - 1; x >= 0; x--) {
-        /* Read all four before writing any: rows past the last one are the same memory. */
-        float16 v = (float16)(load_pixel(to[0] + x * 4), load_pixel(to[1] + x * 4), load_pixel(to[2] + x * 4),
-                              load_pixel(to[3] + x * 4));
-        v = not_negative(v + iir_output_past(&s, sections));
-        store_pixel(to[0] + x * 4, v.s0123);
-        store_pixel(to[1] + x * 4, v.s4567);
-        store_pixel(to[2] + x * 4, v.s89ab);
-        store_pixel(to[3] + x * 4, v.scdef);
+        /* Read all before writing any: rows past the last one are the same memory. */
+        const floatn forward = load_rows((const __global float *const *)to, x);
+        store_rows(to, x, not_negative(forward + iir_output_past(&s, sections)));
         iir_advance(&s, sections, load_rows(from, x));
     }
 }

@@ -15,7 +15,7 @@ __kernel void frame_inverse_depth(__global float *restrict inv_depth, const __gl
     const __global float *z = depth + row * width;
     const __global float *rgba = color + row * width * 4;
     for (int x = 0; x < pitch; x += FRAME_RUN)
-        store_quad(inv_depth + row * pitch + x, inverse_run(z + x, rgba + 4 * x, width - x, nothing));
+        store_lanes(inv_depth + row * pitch + x, inverse_run(z + x, rgba + 4 * x, width - x, nothing));
 }
 
 /* frame_box: mean of blocks of pixels, the resolve of a supersampled image.

@@ -79,14 +79,14 @@ static inline LayeredLayer layered_layer(const __global LayeredMatting *matting,
     return layer;
 }
 
-/* How broad the surfaces of 16 slots of the first peel are, for the blur of a layer. */
-static inline float16 layered_breadth(const __global float *inv_depth, float16 w, LayeredSize size, LayeredLayer layer,
+/* How broad the surfaces of LANES slots of the first peel are, for the blur of a layer. */
+static inline floatn layered_breadth(const __global float *inv_depth, floatn w, LayeredSize size, LayeredLayer layer,
                                       int x, int y)
 {
     return breadth_of(inv_depth, w, x, y, size.width, size.height, size.pitch, layer.around, layer.before.z);
 }
 
-/* Weights of 16 slots in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), with three changes.
+/* Weights of LANES slots in a layer: omega for the first peel (eq. 4), omega-dot for the others (eq. 3), with three changes.
  *
  * Hidden slots may fall as gently as visible ones where the slot before them already stands in this layer or in front of
  * it (has not begun to fall): there nothing shows through that a nearer surface hides.
@@ -102,134 +102,132 @@ static inline float16 layered_breadth(const __global float *inv_depth, float16 w
  * the interval. Inside a broad surface it takes its full weight behind that, or the background would show through; of a
  * thin one, whose blurred coverage is small, both would add up to more than there is. With b the breadth of the surface
  * t / (1 - (1 - t) b) is right for both. */
-static inline float16 layered_weight(const __global float *inv_depth, const __global float *inv, float16 w,
-                                     float16 before, LayeredLayer layer, int peel, LayeredSize size, int x, int y)
+static inline floatn layered_weight(const __global float *inv_depth, const __global float *inv, floatn w,
+                                     floatn before, LayeredLayer layer, int peel, LayeredSize size, int x, int y)
 {
-    const float16 zero = (float16)(0.0f), one = (float16)(1.0f);
-    float16 rising = w * layer.own.x + layer.own.y;
-    float16 falling = w * layer.own.z + layer.own.w;
-    float16 up = clamp01(rising), down = clamp01(falling);
-    float16 at_once = falling >= 1.0f ? one : zero;
+    const floatn zero = (floatn)(0.0f), one = (floatn)(1.0f);
+    floatn rising = w * layer.own.x + layer.own.y;
+    floatn falling = w * layer.own.z + layer.own.w;
+    floatn up = clamp01(rising), down = clamp01(falling);
+    floatn at_once = falling >= 1.0f ? one : zero;
 #if LAYERED_PAPER
     down = peel > 0 ? at_once : down;
 #else
     if (peel > 0) down = before * layer.own.z + layer.own.w >= 1.0f ? down : at_once;
-    float16 between = rising > 0.0f && rising < 1.0f ? one : zero;
-    if (sum16(between) > 0.0f) {
-        float16 part = slope_of(inv, w, x, y, size.height, size.pitch, -1.0f / layer.own.x);
+    floatn between = rising > 0.0f && rising < 1.0f ? one : zero;
+    if (sum_lanes(between) > 0.0f) {
+        floatn part = slope_of(inv, w, x, y, size.height, size.pitch, -1.0f / layer.own.x);
         part *= -layer.own.x * layer.reach;
         part = part > 1.0f ? one : part;
-        part = part < 1e-3f ? (float16)(1e-3f) : part;
+        part = part < 1e-3f ? (floatn)(1e-3f) : part;
         up = clamp01((rising - 1.0f) / part + 1.0f);
-        float16 early = between * up;
-        if (peel == 0 && sum16(early) > 0.0f) {
-            float16 broad = layered_breadth(inv_depth, w, size, layer, x, y) * 2.0f - 1.0f;
+        floatn early = between * up;
+        if (peel == 0 && sum_lanes(early) > 0.0f) {
+            floatn broad = layered_breadth(inv_depth, w, size, layer, x, y) * 2.0f - 1.0f;
             up = early > 0.0f ? up * clamp01(broad) : up;
         }
     }
-    float16 rest = clamp01(w * layer.before.z + layer.before.w); /* 1 - t */
-    float16 shared = rising >= 1.0f && falling >= 1.0f && w >= 0.0f ? rest : zero;
-    if (peel == 0 && sum16(shared) > 0.0f) {
-        float16 others = 1.0f - rest * layered_breadth(inv_depth, w, size, layer, x, y);
-        up = shared > 0.0f ? (1.0f - rest) / (others > 1e-3f ? others : (float16)(1e-3f)) : up;
+    floatn rest = clamp01(w * layer.before.z + layer.before.w); /* 1 - t */
+    floatn shared = rising >= 1.0f && falling >= 1.0f && w >= 0.0f ? rest : zero;
+    if (peel == 0 && sum_lanes(shared) > 0.0f) {
+        floatn others = 1.0f - rest * layered_breadth(inv_depth, w, size, layer, x, y);
+        up = shared > 0.0f ? (1.0f - rest) / (others > 1e-3f ? others : (floatn)(1e-3f)) : up;
         up = shared > 0.0f && others <= 1e-3f ? one : up;
     }
 #endif
     return w < 0.0f ? zero : up * down;
 }
 
-/* Four slots of a peel as the current run composes them. */
-static inline float16 layered_color(float16 c, float4 w, int is_last)
+/* PIXELS slots of a peel as the current run composes them. */
+static inline floatn layered_color(floatn c, floatp w, int is_last)
 {
 #if LAYERED_ALPHA_RUN
-    const float16 red = (float16)(1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0);
-    const float16 alpha = (float16)(0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1);
-    c = c.s33337777bbbbffff * red + c * alpha;
+    c = c.ALPHAS * every_pixel((float4)(1.0f, 0.0f, 0.0f, 0.0f)) + c * every_pixel((float4)(0.0f, 0.0f, 0.0f, 1.0f));
 #endif
 #if LAYERED_VOID
     /* The void behind the last slot stands at its depth, that of an empty slot at infinity. */
-    float4 a = c.s37bf;
-    a = w == 0.0f && a == 0.0f ? (float4)(1.0f) : a;
-    c.s37bf = is_last ? (float4)(1.0f) : a;
+    floatp a = c.ALPHA;
+    a = w == 0.0f && a == 0.0f ? (floatp)(1.0f) : a;
+    c.ALPHA = is_last ? (floatp)(1.0f) : a;
 #endif
     return c;
 }
 
 #if LAYERED_GLASS
-/* Weights of four slots that are not opaque. An opaque slot may stand in several layers at full weight, since more of
+/* Weights of PIXELS slots that are not opaque. An opaque slot may stand in several layers at full weight, since more of
  * the same paint changes nothing; glass must not be counted twice. It is shared out between the layer whose interval it
  * is in and the one before, so that both together let through exactly 1 - alpha: (1 - t) in front of
  * t / (1 - (1 - t) * alpha), t being how far the slot is into its interval. */
-static inline float4 layered_glass(float4 weight, float4 alpha, float4 w, float4 before, LayeredLayer layer, int peel)
+static inline floatp layered_glass(floatp weight, floatp alpha, floatp w, floatp before, LayeredLayer layer, int peel)
 {
-    float4 t = 1.0f - (w * layer.before.z + layer.before.w);
-    t = t > 1.0f ? (float4)(1.0f) : t;
-    if (peel > 0) t = before * layer.before.z + layer.before.w >= 1.0f ? t : (float4)(1.0f);
-    float4 rest = 1.0f - (1.0f - t) * alpha;
-    float4 rising = w * layer.own.x + layer.own.y, falling = w * layer.own.z + layer.own.w;
-    float4 glass = falling < 1.0f ? weight : t / (rest > 1e-3f ? rest : (float4)(1e-3f));
-    glass = rising >= 1.0f && w >= 0.0f ? glass : (float4)(0.0f);
+    floatp t = 1.0f - (w * layer.before.z + layer.before.w);
+    t = t > 1.0f ? (floatp)(1.0f) : t;
+    if (peel > 0) t = before * layer.before.z + layer.before.w >= 1.0f ? t : (floatp)(1.0f);
+    floatp rest = 1.0f - (1.0f - t) * alpha;
+    floatp rising = w * layer.own.x + layer.own.y, falling = w * layer.own.z + layer.own.w;
+    floatp glass = falling < 1.0f ? weight : t / (rest > 1e-3f ? rest : (floatp)(1e-3f));
+    glass = rising >= 1.0f && w >= 0.0f ? glass : (floatp)(0.0f);
     return alpha < LAYERED_OPAQUE ? glass : weight;
 }
 #endif
 
-/* One layer (eq. 2) at the 16 pixels from x on, a multiple of 16: weighted slots, composed front to back.
+/* One layer (eq. 2) at the LANES pixels from x on, a multiple of LANES: weighted slots, composed front to back.
  * `peels` has a bit for each peel that brings something to this tile. */
-static inline void layered_block(float16 quad[4], const __global float *color, const __global float *inv_depth,
+static inline void layered_block(floatn quad[4], const __global float *color, const __global float *inv_depth,
                                  LayeredSize size, LayeredLayer layer, uint peels, int x, int y)
 {
     for (int m = 0; m < size.peels; m++) {
         if (!(peels >> m & 1u)) continue;
         const size_t row = (size_t)m * size.height + y;
         const __global float *inv = inv_depth + row * size.pitch + x;
-        float16 w = load_quad(inv);
-        float16 before = m > 0 ? load_quad(inv - (size_t)size.height * size.pitch) : w;
+        floatn w = load_lanes(inv);
+        floatn before = m > 0 ? load_lanes(inv - (size_t)size.height * size.pitch) : w;
         /* Slots between that hold nothing do not count. */
         for (int p = 2; p <= m; p++) {
-            const int16 is_past_nothing = (before < 0.0f) & (w >= 0.0f);
-            if (sum16(is_past_nothing ? (float16)(1.0f) : (float16)(0.0f)) == 0.0f) break;
-            before = is_past_nothing ? load_quad(inv - (size_t)p * size.height * size.pitch) : before;
+            const intn is_past_nothing = (before < 0.0f) & (w >= 0.0f);
+            if (!any_lane(is_past_nothing)) break;
+            before = is_past_nothing ? load_lanes(inv - (size_t)p * size.height * size.pitch) : before;
         }
-        float16 weight = layered_weight(inv_depth, inv, w, before, layer, m, size, x, y);
-        if (sum16(weight) <= 0.0f) continue;
+        floatn weight = layered_weight(inv_depth, inv, w, before, layer, m, size, x, y);
+        if (sum_lanes(weight) <= 0.0f) continue;
         const __global float *rgba = color + (row * size.width + x) * 4;
-        float4 weights[4] = {weight.s0123, weight.s4567, weight.s89ab, weight.scdef};
-        const float4 inverse[4] = {w.s0123, w.s4567, w.s89ab, w.scdef};
+        floatp weights[4] = FOUR_PARTS(weight);
+        const floatp inverse[4] = FOUR_PARTS(w);
 #if LAYERED_GLASS
-        const float4 inverse_before[4] = {before.s0123, before.s4567, before.s89ab, before.scdef};
+        const floatp inverse_before[4] = FOUR_PARTS(before);
 #endif
 #pragma unroll
         for (int q = 0; q < 4; q++) {
-            int valid = size.width - x - 4 * q;
+            int valid = size.width - x - PIXELS * q;
             if (valid <= 0) continue;
-            float16 c = valid >= 4 ? load_quad(rgba + 16 * q) : load_quad_part(rgba + 16 * q, valid);
+            floatn c = load_pixels(rgba + LANES * q, valid);
             c = layered_color(c, inverse[q], m == size.peels - 1);
 #if LAYERED_GLASS
-            weights[q] = layered_glass(weights[q], c.s37bf, inverse[q], inverse_before[q], layer, m);
+            weights[q] = layered_glass(weights[q], c.ALPHA, inverse[q], inverse_before[q], layer, m);
 #endif
             quad[q] = over(quad[q], c * spread(weights[q]));
         }
-        /* Nothing shows through 16 opaque pixels: no need to read the peels behind them. */
-        if (sum16((float16)(quad[0].s37bf, quad[1].s37bf, quad[2].s37bf, quad[3].s37bf)) >= 16.0f) break;
+        /* Nothing shows through opaque pixels: no need to read the peels behind them. */
+        if (sum_lanes(CHANNEL_OF(quad, ALPHA)) >= (float)LANES) break;
     }
 }
 
-/* Whether the quads at `line` are opaque in all rows: then there is no point in filtering what lies behind. */
+/* Whether the pixels at `line` are opaque in all rows: then there is no point in filtering what lies behind. */
 static inline int layered_hides(const __local float *line, int line_width)
 {
-    float4 covered = (float4)(0.0f);
-    for (int i = 0; i < FIR_ROWS; i++) covered += load_quad_local(line + i * line_width * 4).s37bf;
-    return covered.x + covered.y + covered.z + covered.w >= 4.0f * FIR_ROWS;
+    floatn covered = (floatn)(0.0f);
+    for (int i = 0; i < FIR_ROWS; i++) covered += load_lanes_local(line + i * line_width * 4);
+    return sum_pixels(covered).w >= (float)(PIXELS * FIR_ROWS);
 }
 
-/* Compose filtered quads with those at `line`. */
-static inline void layered_add(__local float *line, int line_width, const float16 filtered[FIR_ROWS], int in_front)
+/* Compose filtered pixels with those at `line`. */
+static inline void layered_add(__local float *line, int line_width, const floatn filtered[FIR_ROWS], int in_front)
 {
 #pragma unroll
     for (int i = 0; i < FIR_ROWS; i++) {
         __local float *at = line + i * line_width * 4;
-        float16 layer = load_quad_local(at);
-        store_quad_local(at, in_front ? over(filtered[i], layer) : over(layer, filtered[i]));
+        floatn layer = load_lanes_local(at);
+        store_lanes_local(at, in_front ? over(filtered[i], layer) : over(layer, filtered[i]));
     }
 }
 
@@ -266,16 +264,16 @@ __kernel void layered_classify(__global uint *restrict tile_peels, const __globa
     const int y_end = (ty + 1) * FIR_ROWS < size.height ? (ty + 1) * FIR_ROWS : size.height;
     for (int k = 0; k < layers; k++) tile_peels[((size_t)k * size.tiles_y + ty) * size.tiles_x + tx] = 0;
     for (int m = 0; m < size.peels; m++) {
-        int16 hits[LAYERED_MAX_LAYERS];
-        for (int k = 0; k < layers; k++) hits[k] = (int16)(0);
-        for (int x = tx * LAYERED_TILE; x < x_end; x += 16) {
+        intn hits[LAYERED_MAX_LAYERS];
+        for (int k = 0; k < layers; k++) hits[k] = (intn)(0);
+        for (int x = tx * LAYERED_TILE; x < x_end; x += LANES) {
             /* A weight is non-zero on an interval of w, so the nearest and farthest slots of a column of the tile tell
              * which layers it can touch. */
-            float16 nearest = (float16)(EMPTY), farthest = (float16)(MAXFLOAT);
+            floatn nearest = (floatn)(EMPTY), farthest = (floatn)(MAXFLOAT);
             for (int y = ty * FIR_ROWS; y < y_end; y++) {
-                float16 w = load_quad(inv_depth + ((size_t)m * size.height + y) * size.pitch + x);
+                floatn w = load_lanes(inv_depth + ((size_t)m * size.height + y) * size.pitch + x);
                 nearest = w > nearest ? w : nearest;
-                w = w < 0.0f ? (float16)(MAXFLOAT) : w;
+                w = w < 0.0f ? (floatn)(MAXFLOAT) : w;
                 farthest = w < farthest ? w : farthest;
             }
             for (int k = 0; k < layers; k++) {
@@ -284,10 +282,7 @@ __kernel void layered_classify(__global uint *restrict tile_peels, const __globa
             }
         }
         for (int k = 0; k < layers; k++) {
-            int8 h8 = hits[k].lo | hits[k].hi;
-            int4 h4 = h8.lo | h8.hi;
-            if (h4.x | h4.y | h4.z | h4.w)
-                tile_peels[((size_t)k * size.tiles_y + ty) * size.tiles_x + tx] |= 1u << m;
+            if (any_lane(hits[k])) tile_peels[((size_t)k * size.tiles_y + ty) * size.tiles_x + tx] |= 1u << m;
         }
     }
 }
@@ -338,27 +333,27 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
     barrier(CLK_LOCAL_MEM_FENCE);
 
     /* The layer by itself first, then what is composed so far: loops that mix both run at half the speed on CPUs. */
-    for (int b = lid; b < line_width / 16; b += items) {
-        int x = x0 - halo + 16 * b;
+    for (int b = lid; b < line_width / LANES; b += items) {
+        int x = x0 - halo + LANES * b;
         if (x < 0 || x >= size.width) continue;
         int tx = x / LAYERED_TILE;
         int is_here = state[tx - tile0] & 2;
-        __local float *line = lines + 64 * b;
+        __local float *line = lines + 4 * LANES * b;
         for (int i = 0; i < FIR_ROWS; i++, line += line_width * 4) {
-            float16 layer[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+            floatn layer[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
             if (is_here && y0 + i < size.height)
                 layered_block(layer, color, inv_depth, size, own, layer_peels[tx], x, y0 + i);
 #pragma unroll
-            for (int q = 0; q < 4; q++) store_quad_local(line + 16 * q, layer[q]);
+            for (int q = 0; q < 4; q++) store_lanes_local(line + LANES * q, layer[q]);
         }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (int b = lid; b < line_width / 4; b += items) {
-        int x = x0 - halo + 4 * b;
+    for (int b = lid; b < line_width / PIXELS; b += items) {
+        int x = x0 - halo + PIXELS * b;
         if (x < 0 || x >= size.width || !(state[x / LAYERED_TILE - tile0] & 1)) continue;
-        __local float *line = lines + 16 * b;
+        __local float *line = lines + LANES * b;
         if (!step.in_front && layered_hides(line, line_width)) continue;
-        float16 acc[FIR_ROWS];
+        floatn acc[FIR_ROWS];
         fir_columns(acc, image, x, y0, size.height, size.pitch, taps + step.taps_in, step.radius_in);
         layered_add(line, line_width, acc, step.in_front);
     }
@@ -366,8 +361,8 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
     fir_extend_lines(lines, line_width, x0 - halo, size.width);
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    for (int b = lid; b < step.segment / 8; b += items) {
-        int x = x0 + 8 * b;
+    for (int b = lid; b < step.segment / (2 * PIXELS); b += items) {
+        int x = x0 + 2 * PIXELS * b;
         if (x >= size.pitch) continue;
         /* Tiles that this one's row filter reads; beyond the image's edges the edge tiles stand for the rest. */
         int tile = x / LAYERED_TILE;
@@ -377,41 +372,41 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
         if (!any) {
             for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
                 __global float *to = out + ((size_t)(y0 + i) * size.pitch + x) * 4;
-                store_quad(to, (float16)(0.0f));
-                store_quad(to + 16, (float16)(0.0f));
+                store_lanes(to, (floatn)(0.0f));
+                store_lanes(to + LANES, (floatn)(0.0f));
             }
             continue;
         }
-        fir_store_pair(out, lines, line_width, 8 * b + halo, x, y0, size.height, size.pitch, taps + step.taps_out,
+        fir_store_pair(out, lines, line_width, 2 * PIXELS * b + halo, x, y0, size.height, size.pitch, taps + step.taps_out,
                        step.radius_out);
     }
 }
 
-/* Divide four pixels by coverage and store them at the place the guard band leaves; see LAYERED_ALPHA_RUN for what the
+/* Divide PIXELS pixels by coverage and store them at the place the guard band leaves; see LAYERED_ALPHA_RUN for what the
  * channels hold. */
-static inline void layered_finish_quad(__global float *out, float16 v, LayeredSize size, int guard, int x, int y)
+static inline void layered_finish_pixels(__global float *out, floatn v, LayeredSize size, int guard, int x, int y)
 {
     const int ox = x - guard, oy = y - guard;
     const int out_width = size.width - 2 * guard, out_height = size.height - 2 * guard;
-    if (oy < 0 || oy >= out_height || ox <= -4 || ox >= out_width) return;
-    float4 coverage = v.s37bf;
-    float4 scale = coverage > LAYERED_MIN_COVERAGE ? 1.0f / coverage : (float4)(0.0f);
+    if (oy < 0 || oy >= out_height || ox <= -PIXELS || ox >= out_width) return;
+    floatp coverage = v.ALPHA;
+    floatp scale = coverage > LAYERED_MIN_COVERAGE ? 1.0f / coverage : (floatp)(0.0f);
     v = v * spread(scale);
-    v = v > 0.0f ? v : (float16)(0.0f); /* "over" takes a rounding from what is behind coverage of 1 and a rounding */
-#if LAYERED_ALPHA_RUN
-    float alpha[4] = {v.s0, v.s4, v.s8, v.sc};
-    for (int i = 0; i < 4; i++)
-        if (ox + i >= 0 && ox + i < out_width)
-            out[((size_t)oy * out_width + ox + i) * 4 + 3] = alpha[i] > 1.0f ? 1.0f : alpha[i];
-#else
-    v.s37bf = scale > 0.0f ? (float4)(1.0f) : (float4)(0.0f);
+    v = v > 0.0f ? v : (floatn)(0.0f); /* "over" takes a rounding from what is behind coverage of 1 and a rounding */
     __global float *to = out + ((long)oy * out_width + ox) * 4;
-    if (ox >= 0 && ox + 4 <= out_width) {
-        store_quad(to, v);
+#if LAYERED_ALPHA_RUN
+#pragma unroll
+    for (int i = 0; i < PIXELS; i++) {
+        const float alpha = pixel_of(v, i).x;
+        if (ox + i >= 0 && ox + i < out_width) to[4 * i + 3] = alpha > 1.0f ? 1.0f : alpha;
+    }
+#else
+    v.ALPHA = scale > 0.0f ? (floatp)(1.0f) : (floatp)(0.0f);
+    if (ox >= 0 && ox + PIXELS <= out_width) {
+        store_lanes(to, v);
     } else {
-        float4 pixel[4] = {v.s0123, v.s4567, v.s89ab, v.scdef};
-        for (int i = 0; i < 4; i++)
-            if (ox + i >= 0 && ox + i < out_width) store_pixel(to + 4 * i, pixel[i]);
+        for (int i = 0; i < PIXELS; i++)
+            if (ox + i >= 0 && ox + i < out_width) store_pixel(to + 4 * i, pixel_of(v, i));
     }
 #endif
 }
@@ -446,20 +441,20 @@ __kernel void layered_resolve(__global float *restrict out, const __global float
     const int has_front = layered_is_reached(front_reached, resolve.front, tx, ty, resolve.radius_front, size);
     const int has_back = layered_is_reached(back_reached, resolve.back, tx, ty, resolve.radius_back, size);
 
-    for (int b = lid; b < FIR_ROWS * LAYERED_TILE / 16; b += items) {
-        int x = x0 + b % (LAYERED_TILE / 16) * 16, i = b / (LAYERED_TILE / 16);
-        float16 layer[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+    for (int b = lid; b < FIR_ROWS * LAYERED_TILE / LANES; b += items) {
+        int x = x0 + b % (LAYERED_TILE / LANES) * LANES, i = b / (LAYERED_TILE / LANES);
+        floatn layer[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
         if (peels && x < size.width && y0 + i < size.height)
             layered_block(layer, color, inv_depth, size, own, peels, x, y0 + i);
 #pragma unroll
-        for (int q = 0; q < 4; q++) store_quad_local(lines + 64 * b + 16 * q, layer[q]);
+        for (int q = 0; q < 4; q++) store_lanes_local(lines + 4 * LANES * b + LANES * q, layer[q]);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (int b = lid; b < LAYERED_TILE / 4; b += items) {
-        int x = x0 + 4 * b;
+    for (int b = lid; b < LAYERED_TILE / PIXELS; b += items) {
+        int x = x0 + PIXELS * b;
         if (x >= size.width) continue;
-        __local float *line = lines + 16 * b;
-        float16 acc[FIR_ROWS];
+        __local float *line = lines + LANES * b;
+        floatn acc[FIR_ROWS];
         if (has_back && !layered_hides(line, LAYERED_TILE)) {
             fir_columns(acc, back, x, y0, size.height, size.pitch, taps + resolve.taps_back, resolve.radius_back);
             layered_add(line, LAYERED_TILE, acc, 0);
@@ -469,7 +464,7 @@ __kernel void layered_resolve(__global float *restrict out, const __global float
             layered_add(line, LAYERED_TILE, acc, 1);
         }
         for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++)
-            layered_finish_quad(out, load_quad_local(line + i * LAYERED_TILE * 4), size, resolve.guard, x, y0 + i);
+            layered_finish_pixels(out, load_lanes_local(line + i * LAYERED_TILE * 4), size, resolve.guard, x, y0 + i);
     }
 }
 
@@ -477,28 +472,28 @@ __kernel void layered_resolve(__global float *restrict out, const __global float
  * reads   image    float[height][pitch][4]  blurred along the rows, the column filter still owed
  *         taps     float[]
  * updates composed float[height][pitch][4]  written afresh when `first`
- * range   2-D, one item per quad of a row and block of FIR_ROWS rows, any local size */
+ * range   2-D, one item per PIXELS pixels of a row and block of FIR_ROWS rows, any local size */
 __kernel void layered_under(__global float *restrict composed, const __global float *restrict image,
                             const __global float *restrict taps, LayeredSize size, int first, int radius, int centre)
 {
-    const int x = 4 * (int)get_global_id(0), y0 = FIR_ROWS * (int)get_global_id(1);
+    const int x = PIXELS * (int)get_global_id(0), y0 = FIR_ROWS * (int)get_global_id(1);
     if (x >= size.width || y0 >= size.height) return;
-    float16 acc[FIR_ROWS];
+    floatn acc[FIR_ROWS];
     fir_columns(acc, image, x, y0, size.height, size.pitch, taps + centre, radius);
     for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
         __global float *to = composed + ((size_t)(y0 + i) * size.pitch + x) * 4;
-        store_quad(to, first ? acc[i] : over(load_quad(to), acc[i]));
+        store_lanes(to, first ? acc[i] : over(load_lanes(to), acc[i]));
     }
 }
 
 /* layered_finish: divide by coverage, crop the guard band.
  * reads   composed  float[height][pitch][4]
  * writes  out       float[height - 2*guard][width - 2*guard][4]
- * range   2-D, one item per quad and row, any local size */
+ * range   2-D, one item per PIXELS pixels of a row, any local size */
 __kernel void layered_finish(__global float *restrict out, const __global float *restrict composed, LayeredSize size,
                              int guard)
 {
-    const int x = 4 * (int)get_global_id(0), y = get_global_id(1);
+    const int x = PIXELS * (int)get_global_id(0), y = get_global_id(1);
     if (x >= size.width || y >= size.height) return;
-    layered_finish_quad(out, load_quad(composed + ((size_t)y * size.pitch + x) * 4), size, guard, x, y);
+    layered_finish_pixels(out, load_lanes(composed + ((size_t)y * size.pitch + x) * 4), size, guard, x, y);
 }

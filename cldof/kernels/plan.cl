@@ -26,25 +26,19 @@ __kernel void plan_pinhole(__global float *restrict out, const __global float *r
     const size_t peel = (size_t)height * width * 4;
     const __global float *row = color + ((size_t)(y + guard) * width + guard) * 4;
     __global float *to = out + (size_t)y * out_width * 4;
-    for (int x = 0; x < out_width; x += 4) {
+    for (int x = 0; x < out_width; x += PIXELS) {
         const int n = out_width - x;
         const __global float *at = row + x * 4;
-        float16 image = n >= 4 ? load_quad(at) : load_quad_part(at, n);
-        float4 alpha = image.s37bf;
-        if (n < 4) alpha = (int4)(0, 1, 2, 3) < n ? alpha : (float4)(1.0f);
-        if (peels > 1 && !(alpha.x == 1.0f && alpha.y == 1.0f && alpha.z == 1.0f && alpha.w == 1.0f)) {
-            image = (float16)(0.0f);
+        floatn image = load_pixels(at, n);
+        /* Pixels past the end of the row hold nothing, which makes the last run of a row a long way round. */
+        if (peels > 1 && least_lane(image.ALPHAS) != 1.0f) {
+            image = (floatn)(0.0f);
             for (int m = peels - 1; m >= 0; m--) {
-                const float16 c = n >= 4 ? load_quad(at + m * peel) : load_quad_part(at + m * peel, n);
+                const floatn c = load_pixels(at + m * peel, n);
                 image = m == peels - 1 ? c : over(c, image);
             }
         }
-        if (n >= 4) {
-            store_quad(to + x * 4, image);
-        } else {
-            const float4 pixel[4] = {image.s0123, image.s4567, image.s89ab, image.scdef};
-            for (int i = 0; i < n; i++) store_pixel(to + (x + i) * 4, pixel[i]);
-        }
+        store_pixels(to + x * 4, image, n);
     }
 }
 
@@ -62,7 +56,7 @@ __kernel void plan_window(__global float *restrict to, const __global float *res
     __global float *target = to + ((size_t)m * window_height + y) * window_pitch * channels;
     const int count = window_width * channels;
     int i = 0;
-    for (; i + 16 <= count; i += 16) store_quad(target + i, load_quad(source + i));
+    for (; i + LANES <= count; i += LANES) store_lanes(target + i, load_lanes(source + i));
     for (; i < count; i++) target[i] = source[i];
     for (; i < window_pitch * channels; i++) target[i] = fill;
 }
@@ -83,6 +77,6 @@ __kernel void plan_paste(__global float *restrict image, const __global float *r
     const __global float *from = part + ((size_t)row * window_width + first - window.x) * 4;
     __global float *to = image + ((size_t)(y - guard) * out_width + first - guard) * 4;
     int i = 0;
-    for (; i + 4 <= end - first; i += 4) store_quad(to + 4 * i, load_quad(from + 4 * i));
+    for (; i + PIXELS <= end - first; i += PIXELS) store_lanes(to + 4 * i, load_lanes(from + 4 * i));
     for (; i < end - first; i++) store_pixel(to + 4 * i, load_pixel(from + 4 * i));
 }

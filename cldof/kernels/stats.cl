@@ -27,45 +27,29 @@ typedef struct {
     float high[4];       /* and the most, 0 for none */
 } StatsTile;
 
-static inline float16 lesser(float16 a, float16 b) { return a < b ? a : b; }
-static inline float16 greater(float16 a, float16 b) { return a > b ? a : b; }
-
-static inline float8 lesser8(float8 a, float8 b) { return a < b ? a : b; }
-
-static inline float min16(float16 v)
-{
-    float8 a = v.lo < v.hi ? v.lo : v.hi;
-    float4 b = a.lo < a.hi ? a.lo : a.hi;
-    float2 c = b.lo < b.hi ? b.lo : b.hi;
-    return c.x < c.y ? c.x : c.y;
-}
-
-static inline float max16(float16 v)
-{
-    return -min16(-v);
-}
-
-static inline uint or16(uint16 v)
-{
-    uint8 a = v.lo | v.hi;
-    uint4 b = a.lo | a.hi;
-    return b.x | b.y | b.z | b.w;
-}
-
 /* Differences in inverse depth; 0 where one of the two has none. */
-static inline float16 stats_step(float16 w, float16 other)
+static inline floatn stats_step(floatn w, floatn other)
 {
-    const float16 low = w < other ? w : other, high = w < other ? other : w;
-    return low < 0.0f ? (float16)(0.0f) : high - low;
+    const floatn low = w < other ? w : other, high = w < other ? other : w;
+    return low < 0.0f ? (floatn)(0.0f) : high - low;
 }
 
-/* Bins of 16 inverse depths. */
-static inline uint16 stats_bin(float16 w, float first, float scale)
+/* Bins of LANES inverse depths. */
+static inline uintn stats_bin(floatn w, float first, float scale)
 {
-    float16 bin = (w - first) * scale;
-    bin = bin < 0.0f ? (float16)(0.0f) : bin;
-    bin = bin > (float)(STATS_BINS - 1) ? (float16)(STATS_BINS - 1) : bin;
-    return convert_uint16(bin);
+    floatn bin = (w - first) * scale;
+    bin = bin < 0.0f ? (floatn)(0.0f) : bin;
+    bin = bin > (float)(STATS_BINS - 1) ? (floatn)(STATS_BINS - 1) : bin;
+    return to_uintn(bin);
+}
+
+/* Sets the bits of the bins of those of LANES inverse depths that there are. */
+static inline void stats_mark(uintn *bins_low, uintn *bins_high, floatn w, float first, float scale)
+{
+    const uintn bin = stats_bin(w, first, scale);
+    const uintn bit = w < 0.0f ? (uintn)(0u) : (uintn)(1u) << (bin & 31u);
+    *bins_low |= bin < 32u ? bit : (uintn)(0u);
+    *bins_high |= bin < 32u ? (uintn)(0u) : bit;
 }
 
 /* stats_tiles: inverse depth of every slot, and ranges of depth and colour of each tile of each peel.
@@ -84,7 +68,7 @@ __kernel void stats_tiles(__global float *restrict inv_depth, __global StatsTile
     const int x = STATS_TILE * tx, n = size.width - x;
     const int y0 = STATS_TILE * ty;
     const int rows = size.height - y0 < STATS_TILE ? size.height - y0 : STATS_TILE;
-    const float16 none = (float16)(MAXFLOAT), zero = (float16)(0.0f), one = (float16)(1.0f);
+    const floatn none = (floatn)(MAXFLOAT), zero = (floatn)(0.0f), one = (floatn)(1.0f);
     const size_t first_row = (size_t)m * size.height + y0;
     __global float *inv = inv_depth + first_row * size.pitch + x;
     const __global float *z = depth + first_row * size.width + x;
@@ -92,57 +76,54 @@ __kernel void stats_tiles(__global float *restrict inv_depth, __global StatsTile
     const size_t color_row = (size_t)size.width * 4;
 
     /* Depth alone first: most tiles turn out to be full or empty, and need no masks. */
-    float16 nearest = (float16)(EMPTY), farthest = none, step = zero, above = nearest;
-    for (int i = 0; i < rows; i++) {
-        const __global float *from = rgba + i * color_row, *at = z + (size_t)i * size.width;
-        const float16 w = inverse_run(at, from, n, nothing);
-        const float next = n > STATS_TILE
-                               ? inverse_of(at[STATS_TILE], load_pixel(from + 4 * STATS_TILE), nothing)
-                               : EMPTY;
-        const float16 right = (float16)(w.s12345678, w.s9abc, w.sde, w.sf, next);
-        store_quad(inv + (size_t)i * size.pitch, w);
-        nearest = greater(nearest, w);
-        farthest = lesser(farthest, w);
-        step = greater(step, greater(stats_step(w, right), stats_step(w, above)));
-        above = w;
-    }
-    if (y0 + rows < size.height) {
-        const float16 below = inverse_run(z + (size_t)rows * size.width, rgba + rows * color_row, n, nothing);
-        step = greater(step, stats_step(above, below));
+    floatn nearest = (floatn)(EMPTY), farthest = none, step = zero;
+    for (int r = 0; r < STATS_TILE; r += LANES) {
+        floatn above = (floatn)(EMPTY);
+        for (int i = 0; i < rows; i++) {
+            const __global float *from = rgba + i * color_row + 4 * r, *at = z + (size_t)i * size.width + r;
+            const floatn w = inverse_run(at, from, n - r, nothing);
+            const float next = n - r > LANES ? inverse_of(at[LANES], load_pixel(from + 4 * LANES), nothing) : EMPTY;
+            store_lanes(inv + (size_t)i * size.pitch + r, w);
+            nearest = greater(nearest, w);
+            farthest = lesser(farthest, w);
+            step = greater(step, greater(stats_step(w, lanes_before(w, next)), stats_step(w, above)));
+            above = w;
+        }
+        if (y0 + rows < size.height) {
+            const floatn below = inverse_run(z + (size_t)rows * size.width + r, rgba + rows * color_row + 4 * r, n - r,
+                                             nothing);
+            step = greater(step, stats_step(above, below));
+        }
     }
     if (tx == size.tiles_x - 1)
         for (int i = 0; i < rows; i++)
-            for (int past = STATS_TILE; x + past < size.pitch; past += STATS_TILE)
-                store_quad(inv + (size_t)i * size.pitch + past, (float16)(EMPTY));
+            for (int past = STATS_TILE; x + past < size.pitch; past += LANES)
+                store_lanes(inv + (size_t)i * size.pitch + past, (floatn)(EMPTY));
     StatsTile tile;
-    tile.nearest = max16(nearest);
+    tile.nearest = greatest_lane(nearest);
     tile.farthest = MAXFLOAT;
     tile.slots = tile.solid = tile.luminance = 0.0f;
-    tile.step = max16(step);
-    float16 low = none, high = zero, sum = zero;
-    uint16 bins_low = (uint16)(0u), bins_high = (uint16)(0u);
+    tile.step = greatest_lane(step);
+    floatn low = none, high = zero, sum = zero;
+    uintn bins_low = (uintn)(0u), bins_high = (uintn)(0u);
     int masked = tile.nearest >= 0.0f;
 
-    if (n >= STATS_TILE && min16(farthest) >= 0.0f) {
+    if (n >= STATS_TILE && least_lane(farthest) >= 0.0f) {
         for (int i = 0; i < rows; i++) {
 #pragma unroll
-            for (int q = 0; q < 4; q++) {
-                const float16 c = load_quad(rgba + i * color_row + 16 * q);
+            for (int q = 0; q < 4 * STATS_TILE; q += LANES) {
+                const floatn c = load_lanes(rgba + i * color_row + q);
                 low = lesser(low, c);
                 high = greater(high, c);
                 sum += c;
             }
         }
-        float4 alpha = low.s37bf;
-        if (alpha.x >= 1.0f && alpha.y >= 1.0f && alpha.z >= 1.0f && alpha.w >= 1.0f) {
+        if (least_pixel(low).w >= 1.0f) {
             masked = 0;
-            for (int i = 0; i < rows; i++) {
-                const uint16 b = stats_bin(load_quad(inv + (size_t)i * size.pitch), first, scale);
-                const uint16 bit = (uint16)(1u) << (b & 31u);
-                bins_low |= b < 32u ? bit : (uint16)(0u);
-                bins_high |= b < 32u ? (uint16)(0u) : bit;
-            }
-            tile.farthest = min16(farthest);
+            for (int i = 0; i < rows; i++)
+                for (int r = 0; r < STATS_TILE; r += LANES)
+                    stats_mark(&bins_low, &bins_high, load_lanes(inv + (size_t)i * size.pitch + r), first, scale);
+            tile.farthest = least_lane(farthest);
             tile.slots = tile.solid = (float)(rows * STATS_TILE);
         } else { /* some of it is glass, or nothing */
             low = none;
@@ -150,47 +131,43 @@ __kernel void stats_tiles(__global float *restrict inv_depth, __global StatsTile
         }
     }
     if (masked) {
-        float16 slots = zero, solid = zero;
-        nearest = (float16)(EMPTY);
+        floatn slots = zero, solid = zero;
+        nearest = (floatn)(EMPTY);
         farthest = none;
-        for (int i = 0; i < rows; i++) {
-            const __global float *from = rgba + i * color_row;
-            const float16 w = load_quad(inv + (size_t)i * size.pitch);
-            float16 c[4];
-            for (int q = 0; q < 4; q++) {
-                const int left = n - 4 * q;
-                c[q] = left >= 4 ? load_quad(from + 16 * q) : left > 0 ? load_quad_part(from + 16 * q, left) : zero;
+        for (int i = 0; i < rows; i++)
+            for (int r = 0; r < STATS_TILE && r < n; r += LANES) {
+                const __global float *from = rgba + i * color_row + 4 * r;
+                const floatn w = load_lanes(inv + (size_t)i * size.pitch + r);
+                floatn c[4];
+                for (int q = 0; q < 4; q++) {
+                    const int left = n - r - PIXELS * q;
+                    c[q] = left > 0 ? load_pixels(from + LANES * q, left) : zero;
+                }
+                const floatn alpha = CHANNEL_OF(c, ALPHA);
+                const intn there = (w >= 0.0f) & (alpha > 0.0f);
+                const floatn is = there ? one : zero;
+                nearest = there ? greater(nearest, w) : nearest;
+                farthest = there ? lesser(farthest, w) : farthest;
+                slots += is;
+                solid += alpha >= 1.0f ? is : zero;
+                stats_mark(&bins_low, &bins_high, there ? w : (floatn)(EMPTY), first, scale);
+                const floatp part[4] = FOUR_PARTS(is);
+                for (int q = 0; q < 4; q++) {
+                    const floatn mask = spread(part[q]), held = c[q] * mask;
+                    low = lesser(low, mask > 0.0f ? held : none);
+                    high = greater(high, held);
+                    sum += held;
+                }
             }
-            const float16 alpha = (float16)(c[0].s37bf, c[1].s37bf, c[2].s37bf, c[3].s37bf);
-            const int16 there = (w >= 0.0f) & (alpha > 0.0f);
-            const float16 is = there ? one : zero;
-            nearest = there ? greater(nearest, w) : nearest;
-            farthest = there ? lesser(farthest, w) : farthest;
-            slots += is;
-            solid += alpha >= 1.0f ? is : zero;
-            const uint16 b = stats_bin(w, first, scale);
-            const uint16 bit = there ? (uint16)(1u) << (b & 31u) : (uint16)(0u);
-            bins_low |= b < 32u ? bit : (uint16)(0u);
-            bins_high |= b < 32u ? (uint16)(0u) : bit;
-            const float4 part[4] = {is.s0123, is.s4567, is.s89ab, is.scdef};
-            for (int q = 0; q < 4; q++) {
-                const float16 mask = spread(part[q]), held = c[q] * mask;
-                low = lesser(low, mask > 0.0f ? held : none);
-                high = greater(high, held);
-                sum += held;
-            }
-        }
-        tile.nearest = max16(nearest);
-        tile.farthest = min16(farthest);
-        tile.slots = sum16(slots);
-        tile.solid = sum16(solid);
+        tile.nearest = greatest_lane(nearest);
+        tile.farthest = least_lane(farthest);
+        tile.slots = sum_lanes(slots);
+        tile.solid = sum_lanes(solid);
     }
-    tile.bins_low = or16(bins_low);
-    tile.bins_high = or16(bins_high);
-    const float4 rgb = (sum.s0123 + sum.s4567) + (sum.s89ab + sum.scdef);
+    tile.bins_low = or_lanes(bins_low);
+    tile.bins_high = or_lanes(bins_high);
+    const float4 rgb = sum_pixels(sum), low4 = least_pixel(low), high4 = greatest_pixel(high);
     tile.luminance = 0.2126f * rgb.x + 0.7152f * rgb.y + 0.0722f * rgb.z;
-    const float8 low8 = lesser8(low.lo, low.hi), high8 = -lesser8(-high.lo, -high.hi);
-    const float4 low4 = low8.lo < low8.hi ? low8.lo : low8.hi, high4 = high8.lo > high8.hi ? high8.lo : high8.hi;
     tile.low[0] = low4.x, tile.low[1] = low4.y, tile.low[2] = low4.z, tile.low[3] = low4.w;
     tile.high[0] = high4.x, tile.high[1] = high4.y, tile.high[2] = high4.z, tile.high[3] = high4.w;
     tiles[((size_t)m * size.tiles_y + ty) * size.tiles_x + tx] = tile;

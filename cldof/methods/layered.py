@@ -424,6 +424,7 @@ class _Builder:
         self.engines = _Engines(method, traits)
         self.blocking = blocking = self.engines.blocking
         self.local_size = min(blocking.local_size, traits.max_work_group_size)
+        self.pixels_a_vector = traits.lanes // 4
         self.tiles_x, self.tiles_y = -(-shape.width // _TILE), -(-shape.height // blocking.rows)
         self.size = struct_scalar(
             _SIZE, shape.width, shape.height, shape.pitch, shape.layers, self.tiles_x, self.tiles_y
@@ -508,13 +509,13 @@ class _Builder:
                     np.int32(radius),
                     np.int32(centre),
                 ),
-                (-(-self.shape.width // 4), self.tiles_y),
+                (-(-self.shape.width // self.pixels_a_vector), self.tiles_y),
                 traffic_bytes=self.pixels * 16 * (2 if layer == 0 else 3),
             )
         self._add(
             "layered_finish",
             (self.image, read(composed), self.size, np.int32(self.shape.guard_px)),
-            (-(-self.shape.width // 4), self.shape.height),
+            (-(-self.shape.width // self.pixels_a_vector), self.shape.height),
             traffic_bytes=self.pixels * 32,
         )
 
@@ -567,8 +568,8 @@ class _Builder:
         names = (name, f"{name}_rows", f"{name}_blurred")
         extent = tuple(np.int32(n) for n in (self.shape.width, self.shape.height, self.shape.pitch))
         for kernel, source, target, items in (
-            ("blur_iir_rows", names[0], names[1], -(-self.shape.height // 4)),
-            ("blur_iir_columns", names[1], names[2], -(-self.shape.width // 4)),
+            ("blur_iir_rows", names[0], names[1], -(-self.shape.height // self.pixels_a_vector)),
+            ("blur_iir_columns", names[1], names[2], -(-self.shape.width // self.pixels_a_vector)),
         ):
             self._image_buffer(target)
             self.passes.append(

@@ -49,9 +49,9 @@ def blurred(device: Device, engine: str, image: np.ndarray, sigma: float) -> np.
         return out[:, :width].astype(np.float64)
     sections = gaussian.iir_sections(sigma)
     args = [padded(image, pitch), sections, *extent]
-    rows = run_pass(device, "blur", "blur_iir_rows", args, shape, (-(-height // 4),))
+    rows = run_pass(device, "blur", "blur_iir_rows", args, shape, (-(-height // (device.lanes // 4)),))
     args = [padded(rows[:, :width], pitch), sections, *extent]
-    out = run_pass(device, "blur", "blur_iir_columns", args, shape, (-(-width // 4),))
+    out = run_pass(device, "blur", "blur_iir_columns", args, shape, (-(-width // (device.lanes // 4)),))
     return out[:, :width].astype(np.float64)
 
 
