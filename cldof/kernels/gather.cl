@@ -27,19 +27,37 @@ typedef struct {
     float weight, change; /* at the least radius of a step; from there to its greatest */
 } GatherTap;
 
-/* Four pixels of a row, whose ends repeat. */
-static inline float4 four_values(const __global float *row, int x, int last)
+static inline int greatest_int(intn v)
 {
-    if (x >= 0 && x + 3 <= last) return load_pixel(row + x);
-    return (float4)(row[clamp_index(x, last)], row[clamp_index(x + 1, last)], row[clamp_index(x + 2, last)],
-                    row[clamp_index(x + 3, last)]);
+#if LANES == 16
+    const int8 eight = v.lo > v.hi ? v.lo : v.hi;
+    const int4 b = eight.lo > eight.hi ? eight.lo : eight.hi;
+#elif LANES == 8
+    const int4 b = v.lo > v.hi ? v.lo : v.hi;
+#else
+    const int4 b = v;
+#endif
+    const int2 c = b.lo > b.hi ? b.lo : b.hi;
+    return c.x > c.y ? c.x : c.y;
 }
 
-static inline float16 four_pixels(const __global float *row, int x, int last)
+/* LANES values of a row, whose ends repeat. */
+static inline floatn values_at(const __global float *row, int x, int last)
 {
-    if (x >= 0 && x + 3 <= last) return load_quad(row + 4 * x);
-    return (float16)(load_pixel(row + 4 * clamp_index(x, last)), load_pixel(row + 4 * clamp_index(x + 1, last)),
-                     load_pixel(row + 4 * clamp_index(x + 2, last)), load_pixel(row + 4 * clamp_index(x + 3, last)));
+    if (x >= 0 && x + LANES - 1 <= last) return load_lanes(row + x);
+    float v[LANES];
+#pragma unroll
+    for (int i = 0; i < LANES; i++) v[i] = row[clamp_index(x + i, last)];
+    return load_lanes_private(v);
+}
+
+/* PIXELS pixels of a row, whose ends repeat. */
+static inline floatn pixels_at(const __global float *row, int x, int last)
+{
+    if (x >= 0 && x + PIXELS - 1 <= last) return load_lanes(row + 4 * x);
+#define EDGE_PIXEL(i) load_pixel(row + 4 * clamp_index(x + i, last))
+    return PIXELS_OF(EDGE_PIXEL);
+#undef EDGE_PIXEL
 }
 
 /* gather_blur: mean over taps of the pixel's own CoC.
@@ -51,47 +69,53 @@ static inline float16 four_pixels(const __global float *row, int x, int last)
  *         first     int[steps + 1]           where each step's taps begin
  * writes  out  float[height - 2*guard][width - 2*guard][4]
  * scalars last  the greatest radius that there are taps for, px; c1, c0  CoC radius in px = c1 / z + c0
- * range   2-D: (items per row, height - 2*guard), any local size; an item takes every get_global_size(0)-th four pixels */
+ * range   2-D: (items per row, height - 2*guard), any local size; an item takes every get_global_size(0)-th LANES
+ *         pixels */
 __kernel void gather_blur(__global float *restrict out, const __global float *restrict flat,
                           const __global float *restrict flat_inv, const __global GatherTap *restrict taps,
                           const __global int *restrict first, GatherSize size, float last, float c1, float c0)
 {
+    const floatn zero = (floatn)(0.0f), one = (floatn)(1.0f);
     const int width = size.width - 2 * size.guard, y = size.guard + (int)get_global_id(1), end = size.width - 1;
-    for (int ox = 4 * get_global_id(0); ox < width; ox += 4 * get_global_size(0)) {
+    for (int ox = LANES * get_global_id(0); ox < width; ox += LANES * get_global_size(0)) {
         const int x = ox + size.guard;
         const size_t row = (size_t)y * size.pitch;
-        const float4 coc = c1 * four_values(flat_inv + row, x, end) + c0;
-        float4 radius = coc < 0.0f ? -coc : coc;
-        radius = radius < last ? radius : last;
-        const float4 within = convert_float4(as_int4(radius) & ((1 << STEP_BITS) - 1)) * (1.0f / (1 << STEP_BITS));
-        int4 step = (as_int4(radius) >> STEP_BITS) - FIRST_STEP; /* below 0: in focus, and all of this pixel is its own */
-        const float16 own = four_pixels(flat + row * 4, x, end);
-        float16 sum = 0.0f;
-        float4 total = 0.0f;
+        const floatn coc = c1 * values_at(flat_inv + row, x, end) + c0;
+        const floatn radius = lesser(absolute(coc), (floatn)(last));
+        const floatn within = to_floatn(as_intn(radius) & ((1 << STEP_BITS) - 1)) * (1.0f / (1 << STEP_BITS));
+        intn step = (as_intn(radius) >> STEP_BITS) - FIRST_STEP; /* below 0: in focus, and all of this pixel is its own */
+        floatn sum[4] = {zero, zero, zero, zero}, total = zero;
         for (;;) { /* mostly once: neighbours are blurred alike */
-            const int2 pair = step.lo > step.hi ? step.lo : step.hi;
-            const int now = pair.x > pair.y ? pair.x : pair.y;
+            const int now = greatest_int(step);
             if (now < 0) break;
-            const float4 mine = step == now ? (float4)(1.0f) : (float4)(0.0f);
-            const float4 part = mine * within;
-            step = step == now ? (int4)(-1) : step;
+            const floatn mine = step == now ? one : zero;
+            const floatn part = mine * within;
+            step = step == now ? (intn)(-1) : step;
             for (int k = first[now]; k < first[now + 1]; k++) {
                 const GatherTap tap = taps[k];
                 const size_t there = (size_t)clamp_index(y + tap.dy, size.height - 1) * size.pitch;
-                float4 weight = mine * tap.weight + part * tap.change;
+                floatn weight = mine * tap.weight + part * tap.change;
 #if GATHER_DEPTH_AWARE
-                const float4 theirs = c1 * four_values(flat_inv + there, x + tap.dx, end) + c0;
-                float4 reach = (theirs < 0.0f ? -theirs : theirs) + 1.0f;
-                reach -= tap.distance < radius ? (float4)(tap.distance) : radius; /* rims are soft */
-                reach = reach < 0.0f ? (float4)(0.0f) : reach;
-                weight *= theirs > coc || reach > 1.0f ? (float4)(1.0f) : reach;
+                const floatn theirs = c1 * values_at(flat_inv + there, x + tap.dx, end) + c0;
+                floatn reach = absolute(theirs) + 1.0f - lesser((floatn)(tap.distance), radius); /* rims are soft */
+                reach = greater(reach, zero);
+                weight *= theirs > coc || reach > 1.0f ? one : reach;
 #endif
-                sum += spread(weight) * four_pixels(flat + there * 4, x + tap.dx, end);
+                const floatp weights[4] = FOUR_PARTS(weight);
+#pragma unroll
+                for (int q = 0; q < 4; q++)
+                    sum[q] += spread(weights[q]) * pixels_at(flat + there * 4, x + tap.dx + PIXELS * q, end);
                 total += weight;
             }
         }
-        const float16 weights = spread(total); /* not 0 where there are taps: one is the pixel itself */
-        store_quad_part(out + ((size_t)(y - size.guard) * width + ox) * 4, weights > 0.0f ? sum / weights : own,
-                        width - ox);
+        const floatp totals[4] = FOUR_PARTS(total); /* not 0 where there are taps: one is the pixel itself */
+#pragma unroll
+        for (int q = 0; q < 4; q++) {
+            const int n = width - ox - PIXELS * q;
+            if (n <= 0) break;
+            const floatn weights = spread(totals[q]), own = pixels_at(flat + row * 4, x + PIXELS * q, end);
+            store_pixels(out + ((size_t)(y - size.guard) * width + ox + PIXELS * q) * 4,
+                         weights > 0.0f ? sum[q] / weights : own, n);
+        }
     }
 }

@@ -15,7 +15,7 @@
  *             rounded up; the first `steps` halvings are even; the pitch is a multiple of 16
  *
  * Kernels over sub-images have the range (items per row, sub-images, rows): an item takes every get_global_size(0)-th
- * block of its row. Rows are numbered so that the same one shows the same part of the frame in all sub-images, which
+ * run of its row. Rows are numbered so that the same one shows the same part of the frame in all sub-images, which
  * follow each other closely and find it in the cache. */
 
 #include "slots.clh"
@@ -25,6 +25,8 @@
 #define PYRAMID_COUNT 24
 /* Rows of level 1 that a work-group of pyramid_matte makes. */
 #define PYRAMID_ROWS 8
+/* Pixels of a row whose depths are told together; sub-images begin at multiples of it. */
+#define PYRAMID_BLOCK 16
 /* Below this coverage the result is 0 rather than a quotient of rounding errors. */
 #define PYRAMID_MIN_COVERAGE 1e-4f
 
@@ -90,31 +92,75 @@ static inline PyramidRamps ramps_of(const __global PyramidMatting *matting, int 
     return ramps;
 }
 
-typedef float8 __attribute__((aligned(4))) float8_unaligned;
+/* A floath holds LANES / 2 values, one for each of 2 * PIXELS pixels. PIXEL_INDEX: 0, 1 ... */
+#if LANES == 16
+typedef float8 floath;
+#define PIXEL_INDEX ((int4)(0, 1, 2, 3))
+#elif LANES == 8
+typedef float4 floath;
+#define PIXEL_INDEX ((int2)(0, 1))
+#else
+typedef float2 floath;
+#define PIXEL_INDEX 0
+#endif
 
-static inline float8 load_eight(const __global float *p) { return *(const __global float8_unaligned *)p; }
-static inline void store_four(__global float *p, float4 v) { *(__global float4_unaligned *)p = v; }
+typedef floath __attribute__((aligned(4))) floath_unaligned;
+typedef floatp __attribute__((aligned(4))) floatp_unaligned;
 
-static inline float sum4(float4 v) { return (v.x + v.y) + (v.z + v.w); }
+static inline floath load_half(const __global float *p) { return *(const __global floath_unaligned *)p; }
+static inline floatp load_part(const __global float *p) { return *(const __global floatp_unaligned *)p; }
+static inline void store_part(__global float *p, floatp v) { *(__global floatp_unaligned *)p = v; }
 
-/* How many of 16 pixels are holes. */
-static inline float count_holes(float16 w) { return sum16(w < 0.0f ? (float16)(1.0f) : (float16)(0.0f)); }
-
-static inline float greatest(float16 v)
+/* The least of PIXELS values. */
+static inline float least_part(floatp v)
 {
-    float8 a = v.lo > v.hi ? v.lo : v.hi;
-    float4 b = a.lo > a.hi ? a.lo : a.hi;
-    float2 c = b.lo > b.hi ? b.lo : b.hi;
-    return c.x > c.y ? c.x : c.y;
+#if LANES == 16
+    const float2 two = v.lo < v.hi ? v.lo : v.hi;
+    return two.x < two.y ? two.x : two.y;
+#elif LANES == 8
+    return v.x < v.y ? v.x : v.y;
+#else
+    return v;
+#endif
 }
 
-static inline float least(float16 v) { return -greatest(-v); }
+static inline float greatest_part(floatp v) { return -least_part(-v); }
 
-/* Four quads of a float16, by index. */
-static inline float4 part(float16 v, int q)
+/* Of 2 * PIXELS pixels those with even places, or with odd ones; and one of the former beside one of the latter. */
+static inline floatn even_pixels(floatn a, floatn b)
 {
-    float8 half_ = q & 2 ? v.hi : v.lo;
-    return q & 1 ? half_.hi : half_.lo;
+#if LANES == 16
+    return (floatn)(a.s0123, a.s89ab, b.s0123, b.s89ab);
+#elif LANES == 8
+    return (floatn)(a.lo, b.lo);
+#else
+    return a;
+#endif
+}
+
+static inline floatn odd_pixels(floatn a, floatn b)
+{
+#if LANES == 16
+    return (floatn)(a.s4567, a.scdef, b.s4567, b.scdef);
+#elif LANES == 8
+    return (floatn)(a.hi, b.hi);
+#else
+    return b;
+#endif
+}
+
+static inline void interleave_pixels(floatn to[2], floatn even, floatn odd)
+{
+#if LANES == 16
+    to[0] = (floatn)(even.s0123, odd.s0123, even.s4567, odd.s4567);
+    to[1] = (floatn)(even.s89ab, odd.s89ab, even.scdef, odd.scdef);
+#elif LANES == 8
+    to[0] = (floatn)(even.lo, odd.lo);
+    to[1] = (floatn)(even.hi, odd.hi);
+#else
+    to[0] = even;
+    to[1] = odd;
+#endif
 }
 
 /* pyramid_flatten: what is seen from each source on, as an opaque RGBZ image.
@@ -122,53 +168,53 @@ static inline float4 part(float16 v, int q)
  *         inv_depth  float[peels][height][pitch]  1/m
  * writes  flat       float[sources][height][pitch][4]  0 in holes and past the row
  *         flat_inv   float[sources][height][pitch]     1/m, of the peel with which half of the pixel is covered
- * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th quad */
+ * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th PIXELS
+ *         pixels */
 __kernel void pyramid_flatten(__global float *restrict flat, __global float *restrict flat_inv,
                               const __global float *restrict color, const __global float *restrict inv_depth,
                               PyramidSize size)
 {
     const int row = get_global_id(1);
     const int source = row / size.height, y = row % size.height;
-    for (int x = 4 * get_global_id(0); x < size.pitch; x += 4 * get_global_size(0)) {
+    for (int x = PIXELS * get_global_id(0); x < size.pitch; x += PIXELS * get_global_size(0)) {
         const int n = size.width - x;
-        float16 image = (float16)(0.0f);
-        float4 depth = (float4)(EMPTY), nearest = (float4)(EMPTY);
+        floatn image = (floatn)(0.0f);
+        floatp depth = (floatp)(EMPTY), nearest = (floatp)(EMPTY);
         for (int m = source; m < size.peels && n > 0; m++) {
             const size_t at = (size_t)m * size.height + y;
             const __global float *rgba = color + (at * size.width + x) * 4;
-            float4 w = load_pixel(inv_depth + at * size.pitch + x);
-            if (w.x < 0.0f && w.y < 0.0f && w.z < 0.0f && w.w < 0.0f) continue;
-            float16 c = n >= 4 ? load_quad(rgba) : load_quad_part(rgba, n);
-            int4 there = (w >= 0.0f) & (c.s37bf > 0.0f);
-            image += (1.0f - image.s33337777bbbbffff) * c;
-            float4 alpha = image.s37bf;
+            floatp w = load_part(inv_depth + at * size.pitch + x);
+            if (greatest_part(w) < 0.0f) continue;
+            floatn c = load_pixels(rgba, n);
+            intp there = (w >= 0.0f) & (c.ALPHA > 0.0f);
+            image = over(image, c);
+            floatp alpha = image.ALPHA;
             nearest = ((nearest < 0.0f) & there) ? w : nearest;
             depth = ((depth < 0.0f) & there & (alpha >= 0.5f)) ? w : depth;
-            if (alpha.x >= 1.0f && alpha.y >= 1.0f && alpha.z >= 1.0f && alpha.w >= 1.0f) break;
+            if (least_part(alpha) >= 1.0f) break;
         }
-        const int4 inside = (int4)(0, 1, 2, 3) < n;
-        float4 alpha = image.s37bf;
+        const intp inside = PIXEL_INDEX < n;
+        floatp alpha = image.ALPHA;
 #if PYRAMID_VOID
-        float4 known = (float4)(1.0f);
+        floatp known = (floatp)(1.0f);
         depth = depth < 0.0f ? nearest : depth;
-        depth = depth < 0.0f ? (float4)(0.0f) : depth;
-        depth = inside ? depth : (float4)(EMPTY);
+        depth = depth < 0.0f ? (floatp)(0.0f) : depth;
+        depth = inside ? depth : (floatp)(EMPTY);
 #else
-        int4 is_known = (alpha >= 0.5f) & inside;
-        float4 known = is_known ? (float4)(1.0f) : (float4)(0.0f);
-        image *= spread(is_known ? 1.0f / alpha : (float4)(0.0f));
-        depth = is_known ? depth : (float4)(EMPTY);
+        intp is_known = (alpha >= 0.5f) & inside;
+        floatp known = is_known ? (floatp)(1.0f) : (floatp)(0.0f);
+        image *= spread(is_known ? 1.0f / alpha : (floatp)(0.0f));
+        depth = is_known ? depth : (floatp)(EMPTY);
 #endif
 #if PYRAMID_ALPHA == 0
-        image.s37bf = known;
+        image.ALPHA = known;
 #elif PYRAMID_ALPHA == 1
-        const float16 red = (float16)(1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0);
-        image = image.s33337777bbbbffff * red;
-        image.s37bf = known;
+        image = image.ALPHAS * every_pixel((float4)(1.0f, 0.0f, 0.0f, 0.0f));
+        image.ALPHA = known;
 #endif
         const size_t to = (size_t)row * size.pitch + x;
-        store_quad(flat + to * 4, image * spread(inside ? (float4)(1.0f) : (float4)(0.0f)));
-        store_four(flat_inv + to, depth);
+        store_lanes(flat + to * 4, image * spread(inside ? (floatp)(1.0f) : (floatp)(0.0f)));
+        store_part(flat_inv + to, depth);
     }
 }
 
@@ -180,47 +226,53 @@ __kernel void pyramid_flatten(__global float *restrict flat, __global float *res
  * writes  slope     float[sources][height][pitch]  1/m per px; 0 where no neighbour is known; anything in holes
  *         broad     float[height][pitch]  share of a blur's weight around a pixel that belongs to the surface of source
  *                   0 or hides it; 1 in front of the first sub-image and behind the last
- *         span      float[sources][height][pitch / 16][2]  1/m; of each block the nearest slot, EMPTY if all are holes,
- *                   and the farthest, or EMPTY minus it if there are holes
+ *         span      float[sources][height][pitch / PYRAMID_BLOCK][2]  1/m; of each block the nearest slot, EMPTY if all
+ *                   are holes, and the farthest, or EMPTY minus it if there are holes
  * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_slope(__global float *restrict slope, __global float *restrict broad,
                             __global float *restrict span, const __global float *restrict flat_inv,
                             const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
     const int row = get_global_id(1), y = row % size.height;
-    for (int x = 16 * get_global_id(0); x < size.pitch; x += 16 * get_global_size(0)) {
-        const __global float *inv = flat_inv + (size_t)row * size.pitch + x;
-        const float16 w = load_quad(inv);
-        store_quad(slope + (size_t)row * size.pitch + x, slope_of(inv, w, x, y, size.height, size.pitch, MAXFLOAT));
-        const float nearest = greatest(w), holes = least(w);
-        const float farthest = -greatest(w < 0.0f ? (float16)(-MAXFLOAT) : -w);
-        __global float *to = span + ((size_t)row * size.pitch + x) / 8;
-        to[0] = nearest;
-        to[1] = holes < 0.0f ? EMPTY - farthest : farthest;
-        if (row >= size.height) continue;
-        float16 share = (float16)(1.0f);
-        for (int i = 0; i < count; i++) {
-            const float2 before = matting->before[i];
-            if (before.x == 0.0f) continue;
-            float16 rest = w * before.x + before.y;
-            int16 is_own = (rest > 0.0f) & (rest <= 1.0f) & (w >= 0.0f);
-            if (sum16(is_own ? (float16)(1.0f) : (float16)(0.0f)) == 0.0f) continue;
-            const int around = matting->around[i], width = size.width, height = size.height, pitch = size.pitch;
-            float16 near = breadth_of(flat_inv, w, x, y, width, height, pitch, around, before.x);
-            float16 far = breadth_of(flat_inv, w, x, y, width, height, pitch, 2 * around, before.x);
-            near = 1.0f - PYRAMID_NEAR_RING * (1.0f - near) - PYRAMID_FAR_RING * (1.0f - far);
-            share = is_own ? near : share;
+    const int width = size.width, height = size.height, pitch = size.pitch;
+    for (int x0 = PYRAMID_BLOCK * get_global_id(0); x0 < pitch; x0 += PYRAMID_BLOCK * get_global_size(0)) {
+        floatn nearest = (floatn)(EMPTY), farthest = (floatn)(MAXFLOAT);
+        intn holes = (intn)(0);
+        for (int x = x0; x < x0 + PYRAMID_BLOCK; x += LANES) {
+            const size_t at = (size_t)row * pitch + x;
+            const floatn w = load_lanes(flat_inv + at);
+            store_lanes(slope + at, slope_of(flat_inv + at, w, x, y, height, pitch, MAXFLOAT));
+            nearest = greater(nearest, w);
+            farthest = w < 0.0f ? farthest : lesser(farthest, w);
+            holes |= w < 0.0f;
+            if (row >= height) continue;
+            floatn share = (floatn)(1.0f);
+            for (int i = 0; i < count; i++) {
+                const float2 before = matting->before[i];
+                if (before.x == 0.0f) continue;
+                floatn rest = w * before.x + before.y;
+                intn is_own = (rest > 0.0f) & (rest <= 1.0f) & (w >= 0.0f);
+                if (!any_lane(is_own)) continue;
+                const int around = matting->around[i];
+                floatn near = breadth_of(flat_inv, w, x, y, width, height, pitch, around, before.x);
+                floatn far = breadth_of(flat_inv, w, x, y, width, height, pitch, 2 * around, before.x);
+                near = 1.0f - PYRAMID_NEAR_RING * (1.0f - near) - PYRAMID_FAR_RING * (1.0f - far);
+                share = is_own ? near : share;
+            }
+            store_lanes(broad + (size_t)row * pitch + x, share);
         }
-        store_quad(broad + (size_t)row * size.pitch + x, share);
+        __global float *to = span + ((size_t)row * pitch + x0) / PYRAMID_BLOCK * 2;
+        to[0] = greatest_lane(nearest);
+        to[1] = any_lane(holes) ? EMPTY - least_lane(farthest) : least_lane(farthest);
     }
 }
 
 /* --- matting (section 3.3) --- */
 
-static inline float16 matting_axis(float16 w)
+static inline floatn matting_axis(floatn w)
 {
 #if PYRAMID_PAPER
-    return 1.0f / (w > 1e-20f ? w : (float16)(1e-20f));
+    return 1.0f / (w > 1e-20f ? w : (floatn)(1e-20f));
 #else
     return w;
 #endif
@@ -234,44 +286,45 @@ static inline float16 matting_axis(float16 w)
  * far as the blur opens a seam, and is broad, or it would vanish at the
  * start of its own interval; what crosses the whole ramp between two pixels is a silhouette. Slope and
  * breadth are read where they count; 0 stands for no slope, and for broad. */
-static inline float16 matting_rise(float16 w, const __global float *slope, const __global float *broad,
-                                   PyramidRamps ramps)
+static inline floatn matting_rise(floatn w, const __global float *slope, const __global float *broad,
+                                  PyramidRamps ramps)
 {
-    float16 rising = matting_axis(w) * ramps.ramp.x + ramps.ramp.y;
+    floatn rising = matting_axis(w) * ramps.ramp.x + ramps.ramp.y;
 #if !PYRAMID_PAPER
-    const float16 zero = (float16)(0.0f), one = (float16)(1.0f);
-    float16 rest = w * ramps.before.x + ramps.before.y; /* 1 - t */
+    const floatn zero = (floatn)(0.0f), one = (floatn)(1.0f);
+    floatn rest = w * ramps.before.x + ramps.before.y; /* 1 - t */
     rest = rising >= 1.0f && rest > 0.0f ? (rest > 1.0f ? one : rest) : zero;
-    float16 between = rising > 0.0f && rising < 1.0f ? one : zero;
-    if (sum16(between) > 0.0f) {
-        float16 needed = slope ? load_quad(slope) : zero;
+    const intn between = rising > 0.0f && rising < 1.0f;
+    if (any_lane(between)) {
+        floatn needed = slope ? load_lanes(slope) : zero;
         needed = needed > -1.0f / ramps.ramp.x ? zero : needed * ramps.seam;
         needed = needed > 1.0f ? one : needed;
-        needed = needed < 1e-3f ? (float16)(1e-3f) : needed;
-        float16 early = clamp01((rising - 1.0f) / needed + 1.0f);
-        if (broad && sum16(early * between) > 0.0f) early *= clamp01(24.0f * load_quad(broad) - 23.0f);
+        needed = needed < 1e-3f ? (floatn)(1e-3f) : needed;
+        floatn early = clamp01((rising - 1.0f) / needed + 1.0f);
+        if (broad && any_lane(between && early > 0.0f)) early *= clamp01(24.0f * load_lanes(broad) - 23.0f);
         rising = rising < 1.0f ? early : rising;
     }
-    if (broad && sum16(rest) > 0.0f) {
-        float16 others = 1.0f - rest * load_quad(broad);
-        float16 own = others > 1e-3f ? (1.0f - rest) / others : one;
+    if (broad && any_lane(rest > 0.0f)) {
+        floatn others = 1.0f - rest * load_lanes(broad);
+        floatn own = others > 1e-3f ? (1.0f - rest) / others : one;
         rising = rest > 0.0f ? own : rising;
     }
 #endif
-    return w < 0.0f ? (float16)(0.0f) : clamp01(rising);
+    return w < 0.0f ? (floatn)(0.0f) : clamp01(rising);
 }
 
-static inline float16 matting_fall(float16 w, float4 ramp) { return clamp01(matting_axis(w) * ramp.z + ramp.w); }
+static inline floatn matting_fall(floatn w, float4 ramp) { return clamp01(matting_axis(w) * ramp.z + ramp.w); }
 
 /* --- culling (section 3.1) --- */
 
 /* Nearest and farthest slot of a block tell of most that a sub-image culls all of it, or none, or has no use for it. */
 static inline const __global float *span_of(const __global float *span, PyramidSize size, int s, int x, int y)
 {
-    return span + (((size_t)s * size.height + y) * size.pitch + x) / 8;
+    return span + (((size_t)s * size.height + y) * size.pitch + x) / PYRAMID_BLOCK * 2;
 }
 
-/* The first source of which a sub-image does not cull all 16 slots; size.sources if there is none, or no such pixel. */
+/* The first source of which a sub-image does not cull all slots of the block of a pixel; size.sources if there is none,
+ * or no such pixel. */
 static inline int first_left(const __global float *span, PyramidSize size, PyramidRamps ramps, int x, int y)
 {
     if (x < 0 || x >= size.pitch || y < 0 || y >= size.height) return size.sources;
@@ -300,76 +353,74 @@ static inline int is_past(const __global float *of, PyramidRamps ramps)
     return of[1] >= 0.0f && of[0] * ramps.ramp.x + ramps.ramp.y >= 1.0f;
 }
 
-/* The first source of 16 frame pixels, from source `first` on, that a sub-image does not cull.
+/* The first source of LANES frame pixels, from source `first` on, that a sub-image does not cull.
  * Returns its front ramp, 0 where all sources are culled; there `from` is -1 and `inverse` EMPTY. `only` is the source
- * of all 16, -1 if all are culled, MIXED if they differ. */
+ * of all pixels, -1 if all are culled, MIXED if they differ. */
 #define MIXED (-2)
-static inline float16 cull(float16 *from, int *only, float16 *inverse, const __global float *flat_inv,
-                           const __global float *slope, const __global float *broad, const __global float *span,
-                           PyramidSize size, PyramidRamps ramps, int x, int y, int first)
+static inline floatn cull(floatn *from, int *only, floatn *inverse, const __global float *flat_inv,
+                          const __global float *slope, const __global float *broad, const __global float *span,
+                          PyramidSize size, PyramidRamps ramps, int x, int y, int first)
 {
-    float16 rise = (float16)(0.0f), w = (float16)(EMPTY), source = (float16)(-1.0f);
-    float left = 16.0f;
+    floatn rise = (floatn)(0.0f), w = (floatn)(EMPTY), source = (floatn)(-1.0f);
     *only = -1;
     for (int s = first; s < size.sources; s++) {
         const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
-        float16 ws = load_quad(flat_inv + at);
+        floatn ws = load_lanes(flat_inv + at);
 #if PYRAMID_PAPER
-        float16 r = matting_rise(ws, 0, 0, ramps);
+        floatn r = matting_rise(ws, 0, 0, ramps);
 #else
         const __global float *of = span_of(span, size, s, x, y);
         if (s == first && is_past(of, ramps) && (s > 0 || of[0] * ramps.before.x + ramps.before.y <= 0.0f)) {
             *only = s;
-            *from = (float16)((float)s);
+            *from = (floatn)((float)s);
             *inverse = ws;
-            return (float16)(1.0f);
+            return (floatn)(1.0f);
         }
-        float16 r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
+        floatn r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
 #endif
-        int16 take = (rise <= 0.0f) & (r > 0.0f);
+        intn take = (rise <= 0.0f) & (r > 0.0f);
         w = take ? ws : w;
-        source = take ? (float16)((float)s) : source;
+        source = take ? (floatn)((float)s) : source;
         rise = take ? r : rise;
-        const float before = left;
-        left = count_holes(w);
-        *only = left == 16.0f ? -1 : left == 0.0f && before == 16.0f ? s : MIXED;
-        if (left == 0.0f) break;
+        const int is_done = !any_lane(w < 0.0f);
+        *only = is_done && *only == -1 ? s : any_lane(w >= 0.0f) ? MIXED : -1;
+        if (is_done) break;
     }
     *from = source;
     *inverse = w;
     return rise;
 }
 
-/* Colours of a quad from the sources that `cull` chose; 0 in holes. */
-static inline float16 source_quad(const __global float *flat, PyramidSize size, float4 from, int only, int x, int y)
+/* Colours of PIXELS pixels from the sources that `cull` chose; 0 in holes. */
+static inline floatn source_pixels(const __global float *flat, PyramidSize size, floatp from, int only, int x, int y)
 {
-    float16 c = (float16)(0.0f);
+    floatn c = (floatn)(0.0f);
     if (only == -1) return c;
-    if (only >= 0) return load_quad(flat + (((size_t)only * size.height + y) * size.pitch + x) * 4);
+    if (only >= 0) return load_lanes(flat + (((size_t)only * size.height + y) * size.pitch + x) * 4);
     for (int s = 0; s < size.sources; s++) {
-        float4 is = from == (float)s ? (float4)(1.0f) : (float4)(0.0f);
-        if (sum4(is) == 0.0f) continue;
-        c += load_quad(flat + (((size_t)s * size.height + y) * size.pitch + x) * 4) * spread(is);
+        floatp is = from == (float)s ? (floatp)(1.0f) : (floatp)(0.0f);
+        if (greatest_part(is) == 0.0f) continue;
+        c += load_lanes(flat + (((size_t)s * size.height + y) * size.pitch + x) * 4) * spread(is);
     }
     return c;
 }
 
 /* --- disocclusion (section 3.2): pull-push --- */
 
-/* One coarser quad from two rows of eight finer pixels: the mean of those of 2x2 that are no holes. Holes hold colour 0
- * and a negative inverse depth. */
-static inline void pull_quad(__global float *color, __global float *inv, float16 top0, float16 top1, float8 w_top,
-                             float16 low0, float16 low1, float8 w_low)
+/* PIXELS coarser pixels from two rows of twice as many finer ones: the mean of those of 2x2 that are no holes. Holes
+ * hold colour 0 and a negative inverse depth. */
+static inline void pull_pixels(__global float *color, __global float *inv, floatn top0, floatn top1, floath w_top,
+                               floatn low0, floatn low1, floath w_low)
 {
-    float8 known_top = w_top < 0.0f ? (float8)(0.0f) : (float8)(1.0f);
-    float8 known_low = w_low < 0.0f ? (float8)(0.0f) : (float8)(1.0f);
-    float8 known = known_top + known_low, w = known_top * w_top + known_low * w_low;
-    float16 a = top0 + low0, b = top1 + low1;
-    float16 sum = (float16)(a.s0123 + a.s4567, a.s89ab + a.scdef, b.s0123 + b.s4567, b.s89ab + b.scdef);
-    float4 count = known.s0246 + known.s1357, depth = w.s0246 + w.s1357;
-    float4 scale = count > 0.0f ? 1.0f / count : (float4)(0.0f);
-    store_quad(color, sum * spread(scale));
-    store_four(inv, count > 0.0f ? depth * scale : (float4)(EMPTY));
+    floath known_top = w_top < 0.0f ? (floath)(0.0f) : (floath)(1.0f);
+    floath known_low = w_low < 0.0f ? (floath)(0.0f) : (floath)(1.0f);
+    floath known = known_top + known_low, w = known_top * w_top + known_low * w_low;
+    floatn a = top0 + low0, b = top1 + low1;
+    floatn sum = even_pixels(a, b) + odd_pixels(a, b);
+    floatp count = known.even + known.odd, depth = w.even + w.odd;
+    floatp scale = count > 0.0f ? 1.0f / count : (floatp)(0.0f);
+    store_lanes(color, sum * spread(scale));
+    store_part(inv, count > 0.0f ? depth * scale : (floatp)(EMPTY));
 }
 
 /* pyramid_cull: culls a sub-image's foreground and pulls level 1 from what is left.
@@ -391,32 +442,33 @@ __kernel void pyramid_cull(__global float *restrict fill, __global float *restri
     if (row < 0 || row >= level.z) return;
     const PyramidRamps ramps = ramps_of(matting, i);
     const int y = 2 * row - sub.x;
-    for (int b = get_global_id(0); b < level.w / 8; b += get_global_size(0)) {
-        const int x = 16 * b - sub.x;
-        const size_t to = (size_t)level.x + (size_t)row * level.w + 8 * b;
-        float16 from[2], w[2];
+    for (int b = get_global_id(0); b < level.w / (2 * PIXELS); b += get_global_size(0)) {
+        const int x = LANES * b - sub.x;
+        const size_t to = (size_t)level.x + (size_t)row * level.w + 2 * PIXELS * b;
+        floatn from[2], w[2];
         int only[2];
+#pragma unroll
         for (int r = 0; r < 2; r++)
             cull(&from[r], &only[r], &w[r], flat_inv, slope, broad, span, size, ramps, x, y + r,
                  first_left(span, size, ramps, x, y + r));
         if (only[0] == -1 && only[1] == -1) {
-            store_quad(fill + to * 4, (float16)(0.0f));
-            store_quad(fill + to * 4 + 16, (float16)(0.0f));
-            store_four(fill_inv + to, (float4)(EMPTY));
-            store_four(fill_inv + to + 4, (float4)(EMPTY));
+            store_lanes(fill + to * 4, (floatn)(0.0f));
+            store_lanes(fill + to * 4 + LANES, (floatn)(0.0f));
+            store_part(fill_inv + to, (floatp)(EMPTY));
+            store_part(fill_inv + to + PIXELS, (floatp)(EMPTY));
             continue;
         }
 #pragma unroll
-        for (int h = 0; h < 2; h++) { /* halves of the block */
-            float16 c[2][2];
+        for (int h = 0; h < 2; h++) { /* halves of the run */
+            floatn c[2][2];
 #pragma unroll
             for (int r = 0; r < 2; r++) {
-                float8 f = h ? from[r].hi : from[r].lo;
-                c[r][0] = source_quad(flat, size, f.lo, only[r], x + 8 * h, y + r);
-                c[r][1] = source_quad(flat, size, f.hi, only[r], x + 8 * h + 4, y + r);
+                const floatp f[4] = FOUR_PARTS(from[r]);
+                c[r][0] = source_pixels(flat, size, f[2 * h], only[r], x + 2 * PIXELS * h, y + r);
+                c[r][1] = source_pixels(flat, size, f[2 * h + 1], only[r], x + 2 * PIXELS * h + PIXELS, y + r);
             }
-            pull_quad(fill + (to + 4 * h) * 4, fill_inv + to + 4 * h, c[0][0], c[0][1], h ? w[0].hi : w[0].lo, c[1][0],
-                      c[1][1], h ? w[1].hi : w[1].lo);
+            pull_pixels(fill + (to + PIXELS * h) * 4, fill_inv + to + PIXELS * h, c[0][0], c[0][1],
+                        h ? w[0].hi : w[0].lo, c[1][0], c[1][1], h ? w[1].hi : w[1].lo);
         }
     }
 }
@@ -433,20 +485,20 @@ __kernel void pyramid_pull(__global float *restrict fill, __global float *restri
     const int4 fine = table[i * PYRAMID_LEVELS + k], coarse = table[i * PYRAMID_LEVELS + k + 1];
     if (row >= coarse.z) return;
     const int has_low = 2 * row + 1 < fine.z;
-    for (int x = 4 * get_global_id(0); x < coarse.w; x += 4 * get_global_size(0)) {
+    for (int x = PIXELS * get_global_id(0); x < coarse.w; x += PIXELS * get_global_size(0)) {
         const size_t to = (size_t)coarse.x + (size_t)row * coarse.w + x;
         if (x >= coarse.y) { /* past the row */
-            store_quad(fill + to * 4, (float16)(0.0f));
-            store_four(fill_inv + to, (float4)(EMPTY));
+            store_lanes(fill + to * 4, (floatn)(0.0f));
+            store_part(fill_inv + to, (floatp)(EMPTY));
             continue;
         }
         const size_t top = (size_t)fine.x + (size_t)(2 * row) * fine.w + 2 * x;
         const size_t low = top + (has_low ? fine.w : 0);
         const float keep = has_low ? 1.0f : 0.0f;
-        float8 w_low = has_low ? load_eight(fill_inv + low) : (float8)(EMPTY);
-        pull_quad(fill + to * 4, fill_inv + to, load_quad(fill + top * 4), load_quad(fill + top * 4 + 16),
-                  load_eight(fill_inv + top), load_quad(fill + low * 4) * keep, load_quad(fill + low * 4 + 16) * keep,
-                  w_low);
+        floath w_low = has_low ? load_half(fill_inv + low) : (floath)(EMPTY);
+        pull_pixels(fill + to * 4, fill_inv + to, load_lanes(fill + top * 4), load_lanes(fill + top * 4 + LANES),
+                    load_half(fill_inv + top), load_lanes(fill + low * 4) * keep,
+                    load_lanes(fill + low * 4 + LANES) * keep, w_low);
     }
 }
 
@@ -464,44 +516,45 @@ static inline Between between(int4 level, int fine_row)
     return rows;
 }
 
-/* Quad at x of a row; beyond its ends the row repeats its edge. */
-static inline float16 load_quad_edge(const __global float *row, int x, int width)
+/* PIXELS pixels at x of a row; beyond its ends the row repeats its edge. */
+static inline floatn load_pixels_edge(const __global float *row, int x, int width)
 {
-    if (x >= 0 && x + 4 <= width) return load_quad(row + x * 4);
-    const int last = width - 1;
-    return (float16)(load_pixel(row + clamp_index(x, last) * 4), load_pixel(row + clamp_index(x + 1, last) * 4),
-                     load_pixel(row + clamp_index(x + 2, last) * 4), load_pixel(row + clamp_index(x + 3, last) * 4));
+    if (x >= 0 && x + PIXELS <= width) return load_lanes(row + x * 4);
+#define EDGE_PIXEL(i) load_pixel(row + clamp_index(x + i, width - 1) * 4)
+    return PIXELS_OF(EDGE_PIXEL);
+#undef EDGE_PIXEL
 }
 
-static inline float8 load_eight_edge(const __global float *row, int x, int width)
+static inline floath load_half_edge(const __global float *row, int x, int width)
 {
-    if (x >= 0 && x + 8 <= width) return load_eight(row + x);
-    float v[8];
-    for (int t = 0; t < 8; t++) v[t] = row[clamp_index(x + t, width - 1)];
-    return (float8)(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7]);
+    if (x >= 0 && x + 2 * PIXELS <= width) return load_half(row + x);
+    float v[2 * PIXELS];
+#pragma unroll
+    for (int t = 0; t < 2 * PIXELS; t++) v[t] = row[clamp_index(x + t, width - 1)];
+    return *(const floath_unaligned *)v;
 }
 
-/* Quadratic B-spline subdivision: the eight finer pixels over the coarser quad at x (weights 9, 3, 3, 1 of 16). */
-static inline void expand_quad(float16 fine[2], const __global float *image, Between rows, int x)
+/* Quadratic B-spline subdivision: the finer pixels over PIXELS coarser ones at x (weights 9, 3, 3, 1 of 16). */
+static inline void expand_pixels(floatn fine[2], const __global float *image, Between rows, int x)
 {
     const __global float *near = image + rows.near * 4, *far = image + rows.far * 4;
-    float16 left = 0.75f * load_quad_edge(near, x - 1, rows.width) + 0.25f * load_quad_edge(far, x - 1, rows.width);
-    float16 mid = 0.75f * load_quad_edge(near, x, rows.width) + 0.25f * load_quad_edge(far, x, rows.width);
-    float16 right = 0.75f * load_quad_edge(near, x + 1, rows.width) + 0.25f * load_quad_edge(far, x + 1, rows.width);
-    float16 even = 0.75f * mid + 0.25f * left, odd = 0.75f * mid + 0.25f * right;
-    fine[0] = (float16)(even.s0123, odd.s0123, even.s4567, odd.s4567);
-    fine[1] = (float16)(even.s89ab, odd.s89ab, even.scdef, odd.scdef);
+    floatn left = 0.75f * load_pixels_edge(near, x - 1, rows.width) + 0.25f * load_pixels_edge(far, x - 1, rows.width);
+    floatn mid = 0.75f * load_pixels_edge(near, x, rows.width) + 0.25f * load_pixels_edge(far, x, rows.width);
+    floatn right = 0.75f * load_pixels_edge(near, x + 1, rows.width) + 0.25f * load_pixels_edge(far, x + 1, rows.width);
+    interleave_pixels(fine, 0.75f * mid + 0.25f * left, 0.75f * mid + 0.25f * right);
 }
 
-/* The same for inverse depth: 16 finer pixels over eight coarser ones. */
-static inline float16 expand_depth(const __global float *inv, Between rows, int x)
+/* The same for inverse depth: LANES finer pixels. */
+static inline floatn expand_depth(const __global float *inv, Between rows, int x)
 {
     const __global float *near = inv + rows.near, *far = inv + rows.far;
-    float8 left = 0.75f * load_eight_edge(near, x - 1, rows.width) + 0.25f * load_eight_edge(far, x - 1, rows.width);
-    float8 mid = 0.75f * load_eight_edge(near, x, rows.width) + 0.25f * load_eight_edge(far, x, rows.width);
-    float8 right = 0.75f * load_eight_edge(near, x + 1, rows.width) + 0.25f * load_eight_edge(far, x + 1, rows.width);
-    float8 e = 0.75f * mid + 0.25f * left, o = 0.75f * mid + 0.25f * right;
-    return (float16)(e.s0, o.s0, e.s1, o.s1, e.s2, o.s2, e.s3, o.s3, e.s4, o.s4, e.s5, o.s5, e.s6, o.s6, e.s7, o.s7);
+    floath left = 0.75f * load_half_edge(near, x - 1, rows.width) + 0.25f * load_half_edge(far, x - 1, rows.width);
+    floath mid = 0.75f * load_half_edge(near, x, rows.width) + 0.25f * load_half_edge(far, x, rows.width);
+    floath right = 0.75f * load_half_edge(near, x + 1, rows.width) + 0.25f * load_half_edge(far, x + 1, rows.width);
+    floatn fine;
+    fine.even = 0.75f * mid + 0.25f * left;
+    fine.odd = 0.75f * mid + 0.25f * right;
+    return fine;
 }
 
 /* pyramid_push: fills the holes of a level from the next coarser one, which has none unless all is a hole.
@@ -516,99 +569,103 @@ __kernel void pyramid_push(__global float *restrict fill, __global float *restri
     const int4 fine = table[i * PYRAMID_LEVELS + k], coarse = table[i * PYRAMID_LEVELS + k + 1];
     if (row >= fine.z || coarse.y == 0) return;
     const Between rows = between(coarse, row);
-    for (int x = 16 * get_global_id(0); x < fine.y; x += 16 * get_global_size(0)) {
+    for (int x = LANES * get_global_id(0); x < fine.y; x += LANES * get_global_size(0)) {
         const size_t to = (size_t)fine.x + (size_t)row * fine.w + x;
-        float16 w = load_quad(fill_inv + to);
-        if (count_holes(w) == 0.0f) continue;
-        float16 filled = expand_depth(fill_inv, rows, x / 2);
-        store_quad(fill_inv + to, w < 0.0f ? filled : w);
+        floatn w = load_lanes(fill_inv + to);
+        if (!any_lane(w < 0.0f)) continue;
+        store_lanes(fill_inv + to, w < 0.0f ? expand_depth(fill_inv, rows, x / 2) : w);
+        const floatp depth[4] = FOUR_PARTS(w);
 #pragma unroll
         for (int h = 0; h < 2; h++) {
-            float8 w8 = h ? w.hi : w.lo;
-            if (sum4(w8.lo < 0.0f ? (float4)(1.0f) : (float4)(0.0f)) +
-                    sum4(w8.hi < 0.0f ? (float4)(1.0f) : (float4)(0.0f)) == 0.0f) continue;
-            float16 c[2];
-            expand_quad(c, fill, rows, x / 2 + 4 * h);
-            __global float *at = fill + (to + 8 * h) * 4;
-            store_quad(at, spread(w8.lo) < 0.0f ? c[0] : load_quad(at));
-            store_quad(at + 16, spread(w8.hi) < 0.0f ? c[1] : load_quad(at + 16));
+            if (least_part(depth[2 * h]) >= 0.0f && least_part(depth[2 * h + 1]) >= 0.0f) continue;
+            floatn c[2];
+            expand_pixels(c, fill, rows, x / 2 + PIXELS * h);
+            __global float *at = fill + (to + 2 * PIXELS * h) * 4;
+            store_lanes(at, spread(depth[2 * h]) < 0.0f ? c[0] : load_lanes(at));
+            store_lanes(at + LANES, spread(depth[2 * h + 1]) < 0.0f ? c[1] : load_lanes(at + LANES));
         }
     }
 }
 
-/* 16 pixels of a sub-image's level 0: culled, disoccluded and weighted. Returns 0 if nothing is there. */
-static inline int matted_block(float16 quad[4], const __global float *flat, const __global float *flat_inv,
-                               const __global float *slope, const __global float *broad, const __global float *span,
-                               const __global float *fill, const __global float *fill_inv, int4 sub, int4 level,
-                               PyramidSize size, PyramidRamps ramps, int x, int y)
+/* Adds LANES pixels of a sub-image's level 0, culled, disoccluded and weighted, to `quad`. Returns 0 if nothing is
+ * there. */
+static inline int add_matted(floatn quad[4], const __global float *flat, const __global float *flat_inv,
+                             const __global float *slope, const __global float *broad, const __global float *span,
+                             const __global float *fill, const __global float *fill_inv, int4 sub, int4 level,
+                             PyramidSize size, PyramidRamps ramps, int x, int y)
 {
     const int first = first_left(span, size, ramps, x, y);
 #if !PYRAMID_PAPER
-    if (first < size.sources && is_behind(span_of(span, size, first, x, y), ramps)) {
-#pragma unroll
-        for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
-        return 0;
-    }
+    if (first < size.sources && is_behind(span_of(span, size, first, x, y), ramps)) return 0;
 #endif
-    float16 from, w;
+    floatn from, w;
     int only;
-    float16 weight = cull(&from, &only, &w, flat_inv, slope, broad, span, size, ramps, x, y, first);
+    floatn weight = cull(&from, &only, &w, flat_inv, slope, broad, span, size, ramps, x, y, first);
     /* What a visible surface with a share of its weight lets through of the next that is not culled. */
-    float16 lets = from == 0.0f ? 1.0f - weight : (float16)(0.0f);
+    floatn lets = from == 0.0f ? 1.0f - weight : (floatn)(0.0f);
     weight *= matting_fall(w, ramps.ramp);
-    float16 filled = (float16)(0.0f); /* weight of holes */
-    float holes = 0.0f;
+    floatn filled = (floatn)(0.0f); /* weight of holes */
     const Between rows = between(level, y + sub.x);
     if (only < 0) {
-        float16 v = expand_depth(fill_inv, rows, (x + sub.x) / 2);
+        floatn v = expand_depth(fill_inv, rows, (x + sub.x) / 2);
         filled = matting_rise(v, 0, 0, ramps) * matting_fall(v, ramps.ramp);
-        filled = w < 0.0f ? filled : (float16)(0.0f);
-        holes = sum16(filled);
+        filled = w < 0.0f ? filled : (floatn)(0.0f);
     }
-    const float pixels = sum16(weight);
-#pragma unroll
-    for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
-    if (pixels + holes + sum16(lets) <= 0.0f) return 0;
-    if (pixels > 0.0f) {
+    const int has_pixels = any_lane(weight > 0.0f), has_holes = any_lane(filled > 0.0f);
+    const int lets_through = any_lane(lets > 0.0f);
+    if (has_pixels) {
+        const floatp sources[4] = FOUR_PARTS(from), weights[4] = FOUR_PARTS(weight);
 #pragma unroll
         for (int q = 0; q < 4; q++)
-            quad[q] = source_quad(flat, size, part(from, q), only, x + 4 * q, y) * spread(part(weight, q));
+            quad[q] += source_pixels(flat, size, sources[q], only, x + PIXELS * q, y) * spread(weights[q]);
     }
 #if !PYRAMID_PAPER
-    if (sum16(lets) > 0.0f) {
+    if (lets_through) {
         for (int s = 1; s < size.sources; s++) {
             const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
-            float16 ws = load_quad(flat_inv + at);
-            float16 r = lets * matting_rise(ws, slope + at, 0, ramps);
-            lets = r > 0.0f ? (float16)(0.0f) : lets;
+            floatn ws = load_lanes(flat_inv + at);
+            floatn r = lets * matting_rise(ws, slope + at, 0, ramps);
+            lets = r > 0.0f ? (floatn)(0.0f) : lets;
             r *= matting_fall(ws, ramps.ramp);
-            if (sum16(r) == 0.0f) continue;
+            if (!any_lane(r > 0.0f)) continue;
+            const floatp weights[4] = FOUR_PARTS(r);
 #pragma unroll
-            for (int q = 0; q < 4; q++) quad[q] += load_quad(flat + (at + 4 * q) * 4) * spread(part(r, q));
+            for (int q = 0; q < 4; q++) quad[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread(weights[q]);
         }
     }
 #endif
-    if (holes > 0.0f) {
+    if (has_holes) {
+        const floatp weights[4] = FOUR_PARTS(filled);
 #pragma unroll
         for (int h = 0; h < 2; h++) {
-            float16 c[2];
-            expand_quad(c, fill, rows, (x + sub.x) / 2 + 4 * h);
-            quad[2 * h] += c[0] * spread(part(filled, 2 * h));
-            quad[2 * h + 1] += c[1] * spread(part(filled, 2 * h + 1));
+            floatn c[2];
+            expand_pixels(c, fill, rows, (x + sub.x) / 2 + PIXELS * h);
+            quad[2 * h] += c[0] * spread(weights[2 * h]);
+            quad[2 * h + 1] += c[1] * spread(weights[2 * h + 1]);
         }
     }
-    return 1;
+    return has_pixels || has_holes || lets_through;
 }
 
 /* --- blurring (section 3.4): 4x4 box analysis, quadratic B-spline synthesis --- */
 
-/* Four coarser pixels from twelve finer ones on, of which ten count: sums of four, two apart. */
-static inline float16 box_quad(float16 a, float16 b, float16 c)
+/* Runs of PIXELS finer pixels that PIXELS coarser ones are made of, of which 2 * PIXELS + 2 pixels count. */
+#define BOX_RUNS (LANES == 4 ? 4 : 3)
+
+/* PIXELS coarser pixels: sums of four finer ones, two apart. */
+static inline floatn box_pixels(const floatn v[BOX_RUNS])
 {
-    float4 s1 = a.s0123 + a.s4567, s2 = a.s89ab + a.scdef, s3 = b.s0123 + b.s4567, s4 = b.s89ab + b.scdef;
-    float4 s5 = c.s0123 + c.s4567;
-    return (float16)(s1, s2, s3, s4) + (float16)(s2, s3, s4, s5);
+    const floatn pairs = even_pixels(v[0], v[1]) + odd_pixels(v[0], v[1]);
+#if LANES == 16
+    return pairs + (floatn)(pairs.s4567, pairs.s89ab, pairs.scdef, v[2].s0123 + v[2].s4567);
+#elif LANES == 8
+    return pairs + (floatn)(pairs.hi, v[2].lo + v[2].hi);
+#else
+    return pairs + (v[2] + v[3]);
+#endif
 }
+
+static inline float4 load_pixel_local(const __local float *p) { return *(const __local float4_unaligned *)p; }
 
 /* pyramid_matte: level 0 of a sub-image, matted, and reduced to level 1 in the same breath.
  * source  sections 3.3 and 3.4
@@ -641,41 +698,40 @@ __kernel void pyramid_matte(__global float *restrict blur, const __global float 
         __local float *line = lines + (p & 1) * line_width * 4;
         const __local float *other = lines + (~p & 1) * line_width * 4;
         if (row >= 0 && row <= height && x0 < level.y) {
-            for (int b = lid; b < line_width / 16; b += items) {
-                const int x = first + 16 * b;
+            for (int b = lid; b < line_width / LANES; b += items) {
+                const int x = first + LANES * b;
                 if (x < 0 || x >= sub.z) continue;
-                float16 sum[4], quad[4];
-                matted_block(sum, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps,
-                             x - sub.x, clamp_index(2 * row - 1, sub.w - 1) - sub.x);
-                matted_block(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps,
-                             x - sub.x, clamp_index(2 * row, sub.w - 1) - sub.x);
+                floatn sum[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
+                for (int r = 2 * row - 1; r <= 2 * row; r++)
+                    add_matted(sum, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps,
+                               x - sub.x, clamp_index(r, sub.w - 1) - sub.x);
 #pragma unroll
-                for (int q = 0; q < 4; q++) store_quad_local(line + (16 * b + 4 * q) * 4, sum[q] + quad[q]);
+                for (int q = 0; q < 4; q++) store_lanes_local(line + (LANES * b + PIXELS * q) * 4, sum[q]);
             }
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         if (p > 0 && row >= 1 && row <= height) { /* row - 1 has both its pairs of rows now */
             const int end = x0 + segment < level.y ? x0 + segment : level.y;
-            for (int x = x0 + 4 * lid; x < end; x += 4 * items) {
+            for (int x = x0 + PIXELS * lid; x < end; x += PIXELS * items) {
                 const int at = 2 * x - 1 - first;
-                float16 v[3];
-                if (x > 0 && 2 * x + 8 < sub.z) {
+                floatn v[BOX_RUNS];
+                if (x > 0 && 2 * x + 2 * PIXELS < sub.z) {
 #pragma unroll
-                    for (int t = 0; t < 3; t++)
-                        v[t] = load_quad_local(line + (at + 4 * t) * 4) + load_quad_local(other + (at + 4 * t) * 4);
+                    for (int t = 0; t < BOX_RUNS; t++) {
+                        const int from = (at + PIXELS * t) * 4;
+                        v[t] = load_lanes_local(line + from) + load_lanes_local(other + from);
+                    }
                 } else {
-                    for (int t = 0; t < 3; t++) {
-                        float4 pixel[4];
-                        for (int j = 0; j < 4; j++) {
-                            int from = (clamp_index(2 * x - 1 + 4 * t + j, sub.z - 1) - first) * 4;
-                            const __local float *u = line + from, *d = other + from;
-                            pixel[j] = (float4)(u[0] + d[0], u[1] + d[1], u[2] + d[2], u[3] + d[3]);
-                        }
-                        v[t] = (float16)(pixel[0], pixel[1], pixel[2], pixel[3]);
+#pragma unroll
+                    for (int t = 0; t < BOX_RUNS; t++) {
+#define LINE_AT(j) ((clamp_index(2 * x - 1 + PIXELS * t + j, sub.z - 1) - first) * 4)
+#define LINE_PIXEL(j) (load_pixel_local(line + LINE_AT(j)) + load_pixel_local(other + LINE_AT(j)))
+                        v[t] = PIXELS_OF(LINE_PIXEL);
+#undef LINE_PIXEL
+#undef LINE_AT
                     }
                 }
-                store_quad(blur + ((size_t)level.x + (size_t)(row - 1) * level.w + x) * 4,
-                           0.0625f * box_quad(v[0], v[1], v[2]));
+                store_lanes(blur + ((size_t)level.x + (size_t)(row - 1) * level.w + x) * 4, 0.0625f * box_pixels(v));
             }
         }
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -692,15 +748,17 @@ __kernel void pyramid_reduce(__global float *restrict blur, const __global int4 
     const int i = get_global_id(1), row = get_global_id(2);
     const int4 fine = table[i * PYRAMID_LEVELS + k], coarse = table[i * PYRAMID_LEVELS + k + 1];
     if (table[i * PYRAMID_LEVELS].y <= k || row >= coarse.z) return;
-    for (int x = 4 * get_global_id(0); x < coarse.y; x += 4 * get_global_size(0)) {
-        float16 v[3] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+    for (int x = PIXELS * get_global_id(0); x < coarse.y; x += PIXELS * get_global_size(0)) {
+        floatn v[BOX_RUNS];
+#pragma unroll
+        for (int t = 0; t < BOX_RUNS; t++) v[t] = (floatn)(0.0f);
         for (int j = 0; j < 4; j++) {
             const __global float *from =
                 blur + ((size_t)fine.x + (size_t)clamp_index(2 * row - 1 + j, fine.z - 1) * fine.w) * 4;
 #pragma unroll
-            for (int t = 0; t < 3; t++) v[t] += load_quad_edge(from, 2 * x - 1 + 4 * t, fine.y);
+            for (int t = 0; t < BOX_RUNS; t++) v[t] += load_pixels_edge(from, 2 * x - 1 + PIXELS * t, fine.y);
         }
-        store_quad(blur + ((size_t)coarse.x + (size_t)row * coarse.w + x) * 4, 0.0625f * box_quad(v[0], v[1], v[2]));
+        store_lanes(blur + ((size_t)coarse.x + (size_t)row * coarse.w + x) * 4, 0.0625f * box_pixels(v));
     }
 }
 
@@ -716,40 +774,42 @@ __kernel void pyramid_expand(__global float *restrict blur, const __global int4 
     if (table[i * PYRAMID_LEVELS].y <= k || row >= fine.z) return;
     const Between rows = between(coarse, row);
     __global float *to = blur + ((size_t)fine.x + (size_t)row * fine.w) * 4;
-    for (int x = 4 * get_global_id(0); 2 * x < fine.y; x += 4 * get_global_size(0)) {
-        float16 quad[2];
-        expand_quad(quad, blur, rows, x);
-        store_quad(to + 8 * x, quad[0]);
-        store_quad(to + 8 * x + 16, quad[1]);
+    for (int x = PIXELS * get_global_id(0); 2 * x < fine.y; x += PIXELS * get_global_size(0)) {
+        floatn c[2];
+        expand_pixels(c, blur, rows, x);
+        store_lanes(to + 8 * x, c[0]);
+        store_lanes(to + 8 * x + LANES, c[1]);
     }
 }
 
 /* --- blending (section 3.5) --- */
 
-/* Divide four pixels by coverage and store them at the place the guard band leaves. */
-static inline void store_finished(__global float *out, float16 v, PyramidSize size, int x, int y)
+/* Divide PIXELS pixels by coverage and store them at the place the guard band leaves. */
+static inline void store_finished(__global float *out, floatn v, PyramidSize size, int x, int y)
 {
     const int ox = x - size.guard, oy = y - size.guard;
     const int width = size.width - 2 * size.guard, height = size.height - 2 * size.guard;
-    if (oy < 0 || oy >= height || ox <= -4 || ox >= width) return;
+    if (oy < 0 || oy >= height || ox <= -PIXELS || ox >= width) return;
     __global float *to = out + ((long)oy * width + ox) * 4;
 #if PYRAMID_DIVIDE
-    float4 coverage = v.s37bf;
-    float4 scale = coverage > PYRAMID_MIN_COVERAGE ? 1.0f / coverage : (float4)(0.0f);
+    floatp coverage = v.ALPHA;
+    floatp scale = coverage > PYRAMID_MIN_COVERAGE ? 1.0f / coverage : (floatp)(0.0f);
     v = v * spread(scale);
-    v.s37bf = scale > 0.0f ? (float4)(1.0f) : (float4)(0.0f);
+    v.ALPHA = scale > 0.0f ? (floatp)(1.0f) : (floatp)(0.0f);
 #endif
 #if PYRAMID_ALPHA == 1
-    float alpha[4] = {v.s0, v.s4, v.s8, v.sc};
-    for (int i = 0; i < 4; i++)
-        if (ox + i >= 0 && ox + i < width) to[4 * i + 3] = alpha[i] > 1.0f ? 1.0f : alpha[i];
+#pragma unroll
+    for (int i = 0; i < PIXELS; i++) {
+        const float alpha = pixel_of(v, i).x;
+        if (ox + i >= 0 && ox + i < width) to[4 * i + 3] = alpha > 1.0f ? 1.0f : alpha;
+    }
 #else
-    if (ox >= 0 && ox + 4 <= width) {
-        store_quad(to, v);
+    if (ox >= 0 && ox + PIXELS <= width) {
+        store_lanes(to, v);
     } else {
-        float4 pixel[4] = {v.s0123, v.s4567, v.s89ab, v.scdef};
-        for (int i = 0; i < 4; i++)
-            if (ox + i >= 0 && ox + i < width) store_pixel(to + 4 * i, pixel[i]);
+#pragma unroll
+        for (int i = 0; i < PIXELS; i++)
+            if (ox + i >= 0 && ox + i < width) store_pixel(to + 4 * i, pixel_of(v, i));
     }
 #endif
 }
@@ -760,7 +820,8 @@ static inline void store_finished(__global float *out, float16 v, PyramidSize si
  *         flat, flat_inv, slope, broad, span, fill, fill_inv  for the one in focus, which is not blurred
  *         table  int4[sub-images][PYRAMID_LEVELS]; matting  PyramidMatting
  * writes  out  float[height - 2*guard][width - 2*guard][4]
- * range   2-D: (items per row, height - 2*guard), any local size; an item takes every get_global_size(0)-th block */
+ * range   2-D: (items per row, height - 2*guard), any local size; an item takes every get_global_size(0)-th LANES
+ *         pixels */
 __kernel void pyramid_blend(__global float *restrict out, const __global float *restrict blur,
                             const __global float *restrict flat, const __global float *restrict flat_inv,
                             const __global float *restrict slope, const __global float *restrict broad,
@@ -770,30 +831,26 @@ __kernel void pyramid_blend(__global float *restrict out, const __global float *
                             const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
     const int y = size.guard + (int)get_global_id(1);
-    for (int x = size.guard / 16 * 16 + 16 * (int)get_global_id(0); x < size.width - size.guard;
-         x += 16 * (int)get_global_size(0)) {
-        float16 sum[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+    for (int x = size.guard / LANES * LANES + LANES * (int)get_global_id(0); x < size.width - size.guard;
+         x += LANES * (int)get_global_size(0)) {
+        floatn sum[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
         for (int i = 0; i < count; i++) {
             const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
-            float16 quad[4];
+            floatn quad[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
             if (sub.y == 0) {
-                if (!matted_block(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size,
-                                  ramps_of(matting, i), x, y)) continue;
+                if (!add_matted(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size,
+                                ramps_of(matting, i), x, y)) continue;
             } else {
                 const Between rows = between(level, y + sub.x);
-                expand_quad(quad, blur, rows, (x + sub.x) / 2);
-                expand_quad(quad + 2, blur, rows, (x + sub.x) / 2 + 4);
+                expand_pixels(quad, blur, rows, (x + sub.x) / 2);
+                expand_pixels(quad + 2, blur, rows, (x + sub.x) / 2 + PIXELS);
             }
-            int covered = 1;
 #pragma unroll
-            for (int q = 0; q < 4; q++) {
-                sum[q] += (1.0f - sum[q].s33337777bbbbffff) * quad[q];
-                covered &= sum[q].s3 >= 1.0f && sum[q].s7 >= 1.0f && sum[q].sb >= 1.0f && sum[q].sf >= 1.0f;
-            }
-            if (covered) break;
+            for (int q = 0; q < 4; q++) sum[q] = over(sum[q], quad[q]);
+            if (least_lane(CHANNEL_OF(sum, ALPHA)) >= 1.0f) break;
         }
 #pragma unroll
         for (int q = 0; q < 4; q++)
-            if (x + 4 * q < size.width) store_finished(out, sum[q], size, x + 4 * q, y);
+            if (x + PIXELS * q < size.width) store_finished(out, sum[q], size, x + PIXELS * q, y);
     }
 }
