@@ -11,6 +11,8 @@ __all__ = [
     "CaptureError",
     "CldofError",
     "DeviceError",
+    "DriverError",
+    "DriverWarning",
     "FrameError",
     "InputError",
     "OutputError",
@@ -46,8 +48,16 @@ class BuildError(DeviceError):
     """A kernel did not compile; the message holds device, options, numbered source and compiler log."""
 
 
+class DriverError(DeviceError):
+    """A driver died in the child process that tried it, or cannot build kernels for this processor."""
+
+
 class OutputError(CldofError):
     """A result cannot be written where it was asked for."""
+
+
+class DriverWarning(UserWarning):
+    """A device that would have been chosen does not work; another one was taken."""
 
 
 class BudgetWarning(UserWarning):

@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 import threading
 import time
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .auto import Auto, Budget, Choice, Chooser, Setting, features, load_curves
-from .errors import CldofError, DeviceError, InputError
+from .errors import CldofError, DeviceError, DriverError, DriverWarning, InputError
 from .frame import FINER, LayeredFrame
 from .host.buffers import BufferPool, HostInput
 from .host.device import Device
@@ -41,6 +43,8 @@ from .planner import (
 )
 
 __all__ = ["PendingResult", "Renderer", "Result", "frame_stats"]
+
+_Made = TypeVar("_Made")
 
 # Pass lists kept for the most recent kinds of frame (shape and plan structure); the pool passes their memory on.
 _KEPT_PROGRAMS = 4
@@ -284,6 +288,8 @@ class Renderer:
         Unknown method or option.
     DeviceError
         No such device.
+    DriverError
+        The driver of that device, and of all others that the choice allows, died when it was tried in a child process.
     """
 
     def __init__(
@@ -322,9 +328,12 @@ class Renderer:
         if context is not None or queue is not None:
             if device is not None:
                 raise InputError("Give a device, or a context or queue of your own, not both.")
+            self._open = None
             self.device = Device.adopt(context=context, queue=queue)
         else:
-            self.device = Device.open(device, profiling=profile, out_of_order=out_of_order)
+            self._open = partial(Device.open, device, profiling=profile, out_of_order=out_of_order)
+            self.device = self._open()
+        self._given_up: set[int] = set()  # devices
         self._slots = frames_in_flight
         self._supersample, self._antialias = supersample, antialias
         self._planned, self._max_change, self._statistics = planned, float(max_change), statistics
@@ -377,24 +386,29 @@ class Renderer:
             )
         shape = FrameShape.of(frame)
         image = _output_array(out, (*_image_size(shape, self._supersample), 4))
-        with self._turn():
-            held = self._upload(frame, shape)
-            if self._automatic is None:
-                assert not isinstance(self.method, Auto)
-                return self._start(held, lens, self.method, image, started, self._supersample, self._antialias)[0]
-            assert held.stats is not None
-            is_alone = self._automatic.under_way == 0
-            fits = FINER**2 * frame.color.nbytes <= self.device.traits.max_alloc_bytes
-            has_finer = frame.has_finer and fits and self._supersample == 1
-            choice, feature = self._automatic.choose(self._known(held)[0], lens, frame, has_finer)
-            faded = None
-            if choice.fades_from is not None:
-                faded, _ = self._start_setting(held, lens, choice.fades_from, np.empty_like(image), started)
-            pending, is_new = self._start_setting(held, lens, choice.setting, image, started)
-            # The first frame of a kind builds what it needs; those that overlap with others wait for them.
-            counts = is_alone and not is_new and faded is None
-            pending.chosen(_Chosen(self._automatic, choice, feature, counts), faded)
-            return pending
+        return self._on_a_device_that_works(lambda: self._begin(frame, shape, lens, image, started))
+
+    def _begin(
+        self, frame: LayeredFrame, shape: FrameShape, lens: Lens, image: NDArray[np.float32], started: float
+    ) -> PendingResult:
+        """Upload a frame and enqueue it by the method of this renderer or of its choice."""
+        held = self._upload(frame, shape)
+        if self._automatic is None:
+            assert not isinstance(self.method, Auto)
+            return self._start(held, lens, self.method, image, started, self._supersample, self._antialias)[0]
+        assert held.stats is not None
+        is_alone = self._automatic.under_way == 0
+        fits = FINER**2 * frame.color.nbytes <= self.device.traits.max_alloc_bytes
+        has_finer = frame.has_finer and fits and self._supersample == 1
+        choice, feature = self._automatic.choose(self._known(held)[0], lens, frame, has_finer)
+        faded = None
+        if choice.fades_from is not None:
+            faded, _ = self._start_setting(held, lens, choice.fades_from, np.empty_like(image), started)
+        pending, is_new = self._start_setting(held, lens, choice.setting, image, started)
+        # The first frame of a kind builds what it needs; those that overlap with others wait for them.
+        counts = is_alone and not is_new and faded is None
+        pending.chosen(_Chosen(self._automatic, choice, feature, counts), faded)
+        return pending
 
     def _start_setting(
         self, held: _DeviceFrame, lens: Lens, setting: Setting, image: NDArray[np.float32], started: float
@@ -446,11 +460,13 @@ class Renderer:
         DeviceError
             The device failed or has not enough memory.
         """
-        with self._turn():
-            held = self._upload(frame, FrameShape.of(frame))
-            if held.stats is None:
-                raise InputError("This renderer was made with planned=False and gathers no statistics.")
-            return held.stats.wait()
+        return self._on_a_device_that_works(lambda: self._gather(frame))
+
+    def _gather(self, frame: LayeredFrame) -> SceneStats:
+        held = self._upload(frame, FrameShape.of(frame))
+        if held.stats is None:
+            raise InputError("This renderer was made with planned=False and gathers no statistics.")
+        return held.stats.wait()
 
     @property
     def peak_device_bytes(self) -> int:
@@ -520,6 +536,32 @@ class Renderer:
         if planned.gaps is not None:
             self.device.pool.free_input(planned.gaps, last_use)
 
+    def _on_a_device_that_works(self, call: Callable[[], _Made]) -> _Made:
+        """What `call` makes in its turn; on another device, if the driver of this one dies over what is to be built."""
+        while True:
+            try:
+                with self._turn():
+                    return call()
+            except DriverError as error:
+                self._replace_device(error)
+
+    def _replace_device(self, error: DriverError) -> None:
+        """Take the next device that the caller's choice allows; raises the error if there is none."""
+        if self._open is None:
+            raise error
+        with self._lock:
+            self._given_up.add(self.device.info.index)
+            try:
+                device = self._open(besides=self._given_up)
+            except DeviceError:
+                raise error from None
+            with suppress(CldofError):
+                self.device.close()
+            self.device = device
+            if isinstance(self.method, Auto):
+                self._automatic = _Automatic(self.method.budget, device)
+        warnings.warn(f"{error} Device {device.info} was taken in its place.", DriverWarning, stacklevel=5)
+
     @contextmanager
     def _turn(self) -> Iterator[None]:
         """One call at a time. What fails half-way, an interrupt included, leaves a renderer that makes all things anew.
@@ -567,7 +609,7 @@ class Renderer:
         preparation = self._free_preparation(shape, frames)
         if preparation is None:
             program = _preparation_program(shape, self.device.traits.is_cpu, self._planned)
-            preparation = compile(program, self.device)
+            preparation = compile(program, self.device, stats_params(frame) if self._planned else {})
         pool = self.device.pool
         color, depth = pool.to_device(frame.color, "upload color"), pool.to_device(frame.depth, "upload depth")
         submission = preparation.submit(
@@ -634,7 +676,7 @@ class Renderer:
             program = planned_program(method, shape, plan, self.device.traits)
             if resolve is not None:
                 program = _resolved(program, resolve)
-            ring = FrameRing(program, self.device, self._slots)
+            ring = FrameRing(program, self.device, self._slots, plan.params)
             self._rings[key] = ring
             # What frames of other kinds left behind is of use again only if their sizes come back.
             pool = self.device.pool
@@ -658,10 +700,11 @@ def frame_stats(device: Device, frame: LayeredFrame) -> SceneStats:
     shape = FrameShape.of(frame)
     pool = device.pool
     inputs = {"color": pool.to_device(frame.color), "depth": pool.to_device(frame.depth)}
-    with compile(_preparation_program(shape, device.traits.is_cpu, with_stats=True), device) as batch:
+    program, params = _preparation_program(shape, device.traits.is_cpu, with_stats=True), stats_params(frame)
+    with compile(program, device, params) as batch:
         submission = batch.submit(
             {name: one.buffer for name, one in inputs.items()},
-            stats_params(frame),
+            params,
             [event for one in inputs.values() for event in one.waits],
         )
         stats = _ComingStats(frame, shape, batch, pool, submission.event).wait()

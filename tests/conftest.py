@@ -23,8 +23,9 @@ from hypothesis.database import DirectoryBasedExampleDatabase
 from cldof.errors import DeviceError
 from cldof.host import opencl as cl
 from cldof.host.buffers import BufferPool
+from cldof.host.caches import prepare_environment, user_cache_dir
 from cldof.host.device import Device, DeviceInfo, Traits, list_devices
-from cldof.host.quirks import prepare_environment, user_cache_dir
+from cldof.host.trial import SWITCH
 
 _REPOSITORY = Path(__file__).parents[1]
 
@@ -49,6 +50,9 @@ UNWRITTEN = 0xFF  # NaN as float32, -1 as int32
 os.environ["POCL_CACHE_DIR"] = os.environ.get("POCL_CACHE_DIR") or str(user_cache_dir() / "cldof-tests")
 prepare_environment()
 os.environ["CLDOF_CACHE_DIR"] = str(Path(os.environ["POCL_CACHE_DIR"]) / "cldof")
+# Tests build hundreds of kinds of frames, each once: trying them in children would take a second each. Those of trials
+# turn them on.
+os.environ[SWITCH] = "0"
 
 
 def _find_devices() -> tuple[list[DeviceInfo], str]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+import warnings
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
 from types import TracebackType
@@ -14,13 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DeviceError
+from ..errors import BuildError, DeviceError, DriverError, DriverWarning
 from . import opencl as cl
 from .buffers import BufferPool
 from .lanes import LANES, PROBE_SOURCE, lanes_for
 from .launch import launch
 from .program import ProgramCache, SourceDirectory
 from .quirks import Effect, effects_of
+from .trial import Trials, is_wanted
 
 __all__ = ["Device", "DeviceInfo", "Traits", "list_devices"]
 
@@ -74,6 +76,8 @@ class DeviceInfo:
     index : int
         Position in :func:`list_devices`.
     name, platform, driver_version : str
+    platform_version, device_version : str
+        What of OpenCL they speak, and as a rule what the driver compiles for.
     kind : str
         ``"cpu"``, ``"gpu"`` or ``"other"``.
     compute_units : int
@@ -87,6 +91,8 @@ class DeviceInfo:
     kind: str
     compute_units: int
     global_mem_bytes: int
+    platform_version: str = ""
+    device_version: str = ""
 
     def __str__(self) -> str:
         return f"{self.index}: {self.name} ({self.kind}, {self.platform}, driver {self.driver_version})"
@@ -165,6 +171,8 @@ class Device:
     check_signatures : bool
         Whether passes are checked against the kernels' argument lists when a frame is compiled. Meant for tests: it
         relies on what drivers say about arguments, and does without binaries from disk, which say nothing.
+    trials : Trials or None
+        Tries in a child process what was never built and run on this device; None builds everything here at once.
     """
 
     def __init__(
@@ -177,6 +185,7 @@ class Device:
         sources: SourceDirectory | None = None,
         check_signatures: bool = False,
         lanes: int | None = None,
+        trials: Trials | None = None,
     ) -> None:
         if lanes is not None and lanes not in LANES:
             raise DeviceError(f"kernels can be built for {', '.join(map(str, LANES))} lanes, not for {lanes!r}")
@@ -186,6 +195,7 @@ class Device:
         self._owned = owned
         self._cl_device = queue.device
         self.info = _info(index, self._cl_device)
+        self.trials = trials
         properties = queue.properties
         self.is_out_of_order = bool(properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE)
         self.is_profiling = bool(properties & cl.command_queue_properties.PROFILING_ENABLE)
@@ -204,6 +214,7 @@ class Device:
         cls,
         choice: int | str | None = None,
         *,
+        besides: Collection[int] = (),
         profiling: bool = False,
         out_of_order: bool = False,
         sources: SourceDirectory | None = None,
@@ -217,7 +228,10 @@ class Device:
         choice : int or str, optional
             An index of :func:`list_devices`, ``"cpu"``, ``"gpu"``, or part of a device's or platform's name in any
             case. None looks at the environment variable ``CLDOF_DEVICE`` and else takes a GPU, or a CPU if there is
-            none.
+            none. Where that leaves a choice, and what would be taken does not work, the next one is taken, with a
+            :class:`~cldof.errors.DriverWarning`.
+        besides : collection of int
+            Indices of devices that are out of the question.
         profiling : bool
             Have the queue measure every command.
         out_of_order : bool
@@ -232,24 +246,39 @@ class Device:
         Raises
         ------
         DeviceError
-            There is no such device; lists those that there are.
+            There is no such device, or none that works; lists those that there are.
+        DriverError
+            The driver of the only one died, or cannot build for this processor.
         """
         devices = _devices()
         infos = [_info(index, device) for index, device in enumerate(devices)]
-        index = _choose(infos, choice if choice is not None else os.environ.get(ENVIRONMENT_VARIABLE) or None)
-        device = devices[index]
-        needs_linker = Effect.NEEDS_LINKER in effects_of(infos[index].platform, infos[index].name)
-        if needs_linker and shutil.which("ld") is None:
-            raise DeviceError(
-                f"device {infos[index]} links kernels with the system linker `ld`, which is not on the PATH. Install "
-                "it (Debian and Ubuntu: apt-get install gcc libc6-dev)."
+        choice = choice if choice is not None else os.environ.get(ENVIRONMENT_VARIABLE) or None
+        candidates = [index for index in _candidates(infos, choice) if index not in besides]
+        failed: list[DeviceError] = []
+        for index in candidates:
+            try:
+                trials = _trials(infos[index], lanes)
+                context, queue = _open(devices[index], infos[index], profiling, out_of_order)
+            except DeviceError as error:
+                failed.append(error)
+                continue
+            if failed:
+                _warn_of(failed[0], infos[index])
+            return cls(
+                context,
+                queue,
+                index=index,
+                sources=sources,
+                check_signatures=check_signatures,
+                lanes=lanes,
+                trials=trials,
             )
-        try:
-            context = cl.Context([device])
-            queue = _new_queue(context, device, profiling, out_of_order)
-        except cl.Error as error:
-            raise DeviceError(f"device {infos[index]} cannot be opened: {error}. Choose another one.") from error
-        return cls(context, queue, index=index, sources=sources, check_signatures=check_signatures, lanes=lanes)
+        if not failed:
+            raise DeviceError("no other OpenCL device is there to be taken in place of the one that failed")
+        if len(failed) > 1:
+            kind = DriverError if all(isinstance(error, DriverError) for error in failed) else DeviceError
+            raise kind(f"no OpenCL device works here. {' Then: '.join(map(str, failed))}") from failed[0]
+        raise failed[0]
 
     @classmethod
     def adopt(
@@ -276,9 +305,17 @@ class Device:
         if queue is not None:
             if context is not None and queue.context != context:
                 raise DeviceError("the queue given to Device.adopt belongs to another context than the one given")
-            return cls(queue.context, queue, owned=False, sources=sources, check_signatures=check_signatures)
+            return cls(
+                queue.context,
+                queue,
+                owned=False,
+                sources=sources,
+                check_signatures=check_signatures,
+                trials=_trials_of_adopted(queue.device),
+            )
         queue = _new_queue(context, context.devices[0], profiling=False, out_of_order=False)
-        return cls(context, queue, sources=sources, check_signatures=check_signatures)
+        trials = _trials_of_adopted(context.devices[0])
+        return cls(context, queue, sources=sources, check_signatures=check_signatures, trials=trials)
 
     @cached_property
     def traits(self) -> Traits:
@@ -338,7 +375,11 @@ class Device:
     def _probe(self, source: str) -> Any:
         """The kernel of a probe."""
         program = cl._cl._Program(self.context, source)
-        program._build(options=b"", devices=[self._cl_device])
+        try:
+            program._build(options=b"", devices=[self._cl_device])
+        except cl.Error as error:
+            log = program.get_build_info(self._cl_device, cl.program_build_info.LOG).strip()
+            raise BuildError(f"{self.info.name} cannot compile the smallest kernel: {log or error}") from error
         return cl.Kernel(program, "probe")
 
     def _int64_atomics_work(self) -> bool:
@@ -374,15 +415,7 @@ class Device:
 
     def _usable_group_size(self) -> int:
         """Halve the driver's claim until a kernel with a barrier gives the right answer."""
-        try:
-            kernel = self._probe(_PROBE_SOURCE)
-        except cl.Error as error:
-            advice = ""
-            if Effect.DRIVER_CACHES_BUILDS in effects_of(self.info.platform, self.info.name):
-                advice = ". Its cache of programs may be damaged or its disk full: delete the cache"
-                if folder := os.environ.get("POCL_CACHE_DIR"):
-                    advice += f" in {folder}"
-            raise DeviceError(f"{self.info.name} cannot compile the smallest kernel: {error}{advice}.") from error
+        kernel = self._probe(_PROBE_SOURCE)
         size: int = self._cl_device.max_work_group_size
         while size > 1:
             if self._group_works(kernel, size):
@@ -429,11 +462,49 @@ def _info(index: int, device: Any) -> DeviceInfo:
         kind=kind,
         compute_units=device.max_compute_units,
         global_mem_bytes=device.global_mem_size,
+        platform_version=device.platform.version,
+        device_version=device.version,
     )
 
 
-def _choose(infos: Sequence[DeviceInfo], choice: int | str | None) -> int:
-    """Index of the device that a choice means; pure, so that it can be tested without devices."""
+def _open(device: Any, info: DeviceInfo, profiling: bool, out_of_order: bool) -> tuple[Any, Any]:
+    """A context and a queue."""
+    if Effect.NEEDS_LINKER in effects_of(info.platform, info.name) and shutil.which("ld") is None:
+        raise DeviceError(
+            f"device {info} links kernels with the system linker `ld`, which is not on the PATH. Install it (Debian "
+            "and Ubuntu: apt-get install gcc libc6-dev)."
+        )
+    try:
+        context = cl.Context([device])
+        return context, _new_queue(context, device, profiling, out_of_order)
+    except cl.Error as error:
+        raise DeviceError(f"device {info} cannot be opened: {error}. Choose another one.") from error
+
+
+def _trials(info: DeviceInfo, lanes: int | None) -> Trials | None:
+    """Trials of a device, after the first one; None where there are to be none."""
+    if not is_wanted():
+        return None
+    trials = Trials(info)
+    trials.device(lanes)
+    return trials
+
+
+def _trials_of_adopted(device: Any) -> Trials | None:
+    """The same for a device that the caller has opened, if a child can find it."""
+    adopted = _info(-1, device)
+    for info in list_devices():
+        if replace(info, index=-1) == adopted:
+            return _trials(info, None)
+    return None
+
+
+def _warn_of(error: DeviceError, taken: DeviceInfo) -> None:
+    warnings.warn(f"{error} Device {taken} was taken in its place.", DriverWarning, stacklevel=4)
+
+
+def _candidates(infos: Sequence[DeviceInfo], choice: int | str | None) -> list[int]:
+    """Indices of the devices that a choice may mean, the best first; pure, so that it can be tested without devices."""
     if not infos:
         raise DeviceError(
             "no OpenCL device was found. Any driver will do: a GPU's own, or for the CPU "
@@ -455,7 +526,7 @@ def _choose(infos: Sequence[DeviceInfo], choice: int | str | None) -> int:
             f"no OpenCL device matches {choice!r}. There is: {'; '.join(map(str, infos))}. Choose by index, by part "
             f"of a name, 'cpu' or 'gpu', in the call or in the environment variable {ENVIRONMENT_VARIABLE}."
         )
-    return min(matching, key=_preference).index
+    return [info.index for info in sorted(matching, key=_preference)]
 
 
 def _preference(info: DeviceInfo) -> tuple[bool, bool, int]:

@@ -1,7 +1,7 @@
 """How many floats a work-item computes with at a time, ``LANES`` of the kernels: one table.
 
-As wide as the device's vector registers. Twice as wide halves the registers that a kernel has for different things: they
-spill, and compilers warn of calls that pass such vectors, or crash over them. On GPUs a vector is so many registers of
+As wide as the device's vector registers. Twice as wide halves the registers that a kernel has for different things:
+they spill, and compilers warn of calls that pass such vectors, or crash over them. On GPUs a vector is registers of
 one thread, and what does not fit goes to memory.
 """
 
@@ -15,8 +15,8 @@ LANES = (16, 8, 4)
 # One pixel, or four values of neighbouring pixels: registers for a hundred such are what lets enough threads run.
 GPU_LANES = 4
 
-# By the compiler's own word, where it is one for a processor: it may know less than the processor can, and what a driver
-# says of native widths is then too much (PoCL 3.0 says 16 on AMD's Zen 4, for which its LLVM 14 has no AVX-512).
+# By the compiler's own word, where it is one for a processor: it may know less than the processor can, and what a
+# driver says of native widths is then too much (PoCL 3.0 says 16 on AMD's Zen 4, for which its LLVM 14 has no AVX-512).
 PROBE_SOURCE = """
 __kernel void probe(__global uint *out)
 {

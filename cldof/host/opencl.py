@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from ..errors import DeviceError
-from .quirks import prepare_environment
+from .caches import prepare_environment
 
 
 def __getattr__(name: str) -> Any:

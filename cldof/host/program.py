@@ -7,24 +7,25 @@ rusticl. For the same reason programs are built through ``pyopencl._cl``: ``pyop
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import math
-import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 
-from ..errors import BuildError, DeviceError, InputError, OutputError
+from ..errors import BuildError, DeviceError, DriverError, InputError, OutputError
 from ..files import atomic_write
 from . import opencl as cl
-from .quirks import Effect, effects_of, user_cache_dir
+from .caches import default_cache_dir, give_up_programs
+from .quirks import Effect, effects_of
 
-__all__ = ["BUILD_OPTIONS", "Defines", "ProgramCache", "SourceDirectory", "default_cache_dir", "expand", "numbered"]
+__all__ = ["BUILD_OPTIONS", "Defines", "ProgramCache", "SourceDirectory", "expand", "numbered"]
 
 # One dialect everywhere; argument info lets the scheduler check kernels against passes. No fast-math: it lets compilers
 # drop tests for NaN and infinity.
@@ -83,13 +84,6 @@ def numbered(source: str) -> str:
     return "\n".join(out)
 
 
-def default_cache_dir() -> Path:
-    """Where built programs are kept: ``CLDOF_CACHE_DIR``, or the user's cache directory."""
-    if chosen := os.environ.get("CLDOF_CACHE_DIR"):
-        return Path(chosen)
-    return user_cache_dir() / "cldof"
-
-
 class ProgramCache:
     """Builds programs for one device and keeps them, in memory and, where the driver does not, on disk.
 
@@ -98,7 +92,7 @@ class ProgramCache:
     context : pyopencl.Context
     device : pyopencl.Device
     directory : SourceDirectory
-        Where the ``.cl`` and ``.clh`` files are.
+        Where the ``.cl`` and ``.clh`` files are. Also an attribute.
     cache_dir : Path, optional
         Of the disk cache; :func:`default_cache_dir` unless told otherwise.
     defines : callable
@@ -119,13 +113,15 @@ class ProgramCache:
     ) -> None:
         self._context = context
         self._device = device
-        self._directory = directory
+        self.directory = directory
         self._defines = defines
         self._programs: dict[tuple[str, tuple[str, ...]], Any] = {}
+        self._sources: dict[tuple[str, tuple[str, ...]], str] = {}
         self._lock = Lock()
         effects = effects_of(device.platform.name, device.name)
         is_cpu = bool(device.type & cl.device_type.CPU)
         self._prefix = _HINTED if is_cpu and Effect.VECTORIZES_VECTORS in effects else ""
+        self._trusts_cache = Effect.TRUSTS_CACHE in effects
         driver_caches = Effect.DRIVER_CACHES_BUILDS in effects
         self._disk = None if driver_caches or from_source else _DiskCache(cache_dir or default_cache_dir())
 
@@ -150,24 +146,49 @@ class ProgramCache:
             found = sorted(program.get_info(cl.program_info.KERNEL_NAMES).split(";"))
             if name in found:
                 raise DeviceError(f"{self._device.name.strip()} cannot make a kernel of {name!r}: {error}") from error
-            raise BuildError(f"{stem}.cl has no kernel {name!r}; it has {', '.join(found) or 'none'}") from error
+            if found == [""] and self._trusts_cache:
+                self._give_up(stem, error)
+            raise BuildError(f"{stem}.cl has no kernel {name!r}; it has {', '.join(found)}") from error
+
+    def _give_up(self, stem: str, error: Exception) -> NoReturn:
+        """A program without any kernel is one over which an earlier process has died."""
+        give_up_programs()
+        # PoCL ends the process by abort() when a context goes that has held such a program: this one stays.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._context))
+        raise DriverError(
+            f"{self._device.name.strip()} ({self._device.platform.name}) has {stem}.cl in its cache of programs, but "
+            "without kernels: an earlier process died while it was compiled. Run this again: the cache is made anew."
+        ) from error
 
     def program(self, stem: str, defines: Defines = ()) -> Any:
         """The built program of ``<stem>.cl`` with those defines."""
-        own = {name for name, _ in defines}
-        defines = (*(one for one in self._defines() if one[0] not in own), *defines)
         # By text, since 1, 1.0 and True are the same key but not the same define.
         key = (stem, _define_lines(defines))
         with self._lock:
             program = self._programs.get(key)
             if program is None:
-                program = self._programs[key] = self._build(self._prefix + expand(stem, defines, self._directory))
+                program = self._programs[key] = self._build(self._expanded(key, defines))
         return program
+
+    def source(self, stem: str, defines: Defines = ()) -> str:
+        """What is compiled for ``<stem>.cl`` with those defines."""
+        with self._lock:
+            return self._expanded((stem, _define_lines(defines)), defines)
+
+    def _expanded(self, key: tuple[str, tuple[str, ...]], defines: Defines) -> str:
+        source = self._sources.get(key)
+        if source is None:
+            own = {name for name, _ in defines}
+            everywhere = (one for one in self._defines() if one[0] not in own)
+            source = self._prefix + expand(key[0], (*everywhere, *defines), self.directory)
+            self._sources[key] = source
+        return source
 
     def clear(self) -> None:
         """Forget the programs in memory; files that changed are read again."""
         with self._lock:
             self._programs.clear()
+            self._sources.clear()
 
     def _key(self, source: str) -> str:
         """Name in the disk cache: a digest of all that the binary depends on."""

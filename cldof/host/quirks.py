@@ -2,31 +2,10 @@
 
 from __future__ import annotations
 
-import atexit
-import os
-import shutil
-import struct
-import sys
-import tempfile
-from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
-from typing import IO
 
-if sys.platform != "win32":
-    import fcntl
-
-__all__ = ["QUIRKS", "Effect", "Quirk", "effects_of", "prepare_environment", "user_cache_dir"]
-
-
-_MOST_PROCESSES = 64
-_LOCK = "cldof.lock"
-# Locks on directories, for as long as the process lives: the environment that they go with is the process's, too.
-_claimed: dict[Path, IO[bytes]] = {}
-
-# Room that a cache of programs needs: those of all methods take 5 MB.
-_CACHE_BYTES = 32 << 20
+__all__ = ["QUIRKS", "Effect", "Quirk", "effects_of"]
 
 
 class Effect(Enum):
@@ -35,6 +14,7 @@ class Effect(Enum):
     DRIVER_CACHES_BUILDS = "the driver keeps built programs on disk; ours would only be a second copy"
     NEEDS_LINKER = "needs the system linker for every build, and ends the whole process where there is none"
     VECTORIZES_VECTORS = "builds take ten times as long unless told that kernels use vectors already"
+    TRUSTS_CACHE = "takes whatever is in its folder of programs for whole; a process gets a folder of its own"
     LAST_RESORT = "chosen only by name or index, or when there is nothing else"
 
 
@@ -92,6 +72,14 @@ QUIRKS = (
         date="2026-11-23",
     ),
     Quirk(
+        platform="portable computing language",
+        device="",
+        effect=Effect.TRUSTS_CACHE,
+        reason="a process that dies while it compiles leaves a program without kernels, over which later ones abort()",
+        source="seen with pip's PoCL 3.0 on AMD Zen 4, and wherever it is told that it runs on znver3 with AVX-512",
+        date="2026-11-30",
+    ),
+    Quirk(
         platform="intel(r) opencl",
         device="",
         effect=Effect.VECTORIZES_VECTORS,
@@ -121,95 +109,3 @@ QUIRKS = (
 def effects_of(platform: str, device: str) -> frozenset[Effect]:
     """Effects that apply to the device of that name on that platform."""
     return frozenset(quirk.effect for quirk in QUIRKS if quirk.matches(platform, device))
-
-
-def prepare_environment() -> None:
-    """Give PoCL a cache directory that it can write to; runs before pyopencl is imported.
-
-    Without one, PoCL 3.0 either reports no device at all (home directory missing or read-only, as in many containers)
-    or fails every build; on a full disk, or when it finds a program that was cut short, it ends the process. Only a
-    directory that cannot work is replaced. Processes that build the same program at once crash now and then when they
-    share a directory, so a second process at the same time gets one below the first one's.
-    """
-    chosen = os.environ.get("POCL_CACHE_DIR")
-    directory = user_cache_dir() if chosen is None else Path(chosen)
-    if not _can_hold_files(directory):
-        owner = os.getuid() if hasattr(os, "getuid") else "user"
-        directory = Path(tempfile.gettempdir()) / f"cldof-pocl-{owner}"
-        os.environ["POCL_CACHE_DIR"] = str(directory)
-    elif chosen is None:
-        directory = directory / "pocl" / "kcache"  # PoCL's own choice
-    own = _claim(directory)
-    if own != directory:
-        os.environ["POCL_CACHE_DIR"] = str(own)
-    _drop_cut_programs(own)
-
-
-def user_cache_dir() -> Path:
-    """Where programs keep what they can make again; need not exist."""
-    if base := os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA"):
-        return Path(base)
-    try:
-        return Path.home() / ".cache"
-    except RuntimeError:  # a user without a home directory
-        return Path(tempfile.gettempdir())
-
-
-def _can_hold_files(directory: Path) -> bool:
-    """Whether files can be made in it, or it and its parents can be made, and there is room. Leaves nothing behind."""
-    for path in (directory, *directory.parents):
-        if path.exists():
-            try:
-                # Tried, since permissions tell little to root and of file systems that take no files.
-                with tempfile.TemporaryFile(dir=path):
-                    return shutil.disk_usage(path).free >= _CACHE_BYTES
-            except OSError:
-                return False
-    return False
-
-
-def _claim(directory: Path) -> Path:
-    """A directory that no other process of ours uses: this one, or a numbered one below; until the process ends."""
-    if sys.platform == "win32":
-        return directory
-    for number in range(_MOST_PROCESSES):
-        candidate = directory / f"cldof-{number}" if number else directory
-        if candidate in _claimed:
-            return candidate
-        try:
-            candidate.mkdir(parents=True, exist_ok=True)
-            lock = open(candidate / _LOCK, "wb")  # noqa: SIM115 - held until the process ends
-        except OSError:
-            break
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.close()
-            continue
-        _claimed[candidate] = lock
-        atexit.register(lock.close)  # an open file at the end of a process is a warning
-        return candidate
-    return directory
-
-
-def _drop_cut_programs(directory: Path) -> None:
-    """Remove programs that end before their table of sections does, as a power failure or a full disk leaves them."""
-    for folder, below, names in os.walk(directory):
-        # Those of other processes, which may be writing there.
-        below[:] = [name for name in below if not os.path.exists(os.path.join(folder, name, _LOCK))]
-        for name in names:
-            if name.endswith(".so"):
-                with suppress(OSError):
-                    _drop_if_cut(os.path.join(folder, name))
-
-
-def _drop_if_cut(path: str) -> None:
-    with open(path, "rb") as file:
-        head, size = file.read(64), os.fstat(file.fileno()).st_size
-    if len(head) == 64 and head[:5] != b"\x7fELF\x02":
-        return  # not one of 64-bit Linux
-    if len(head) == 64:
-        (table,) = struct.unpack_from("<Q", head, 40)
-        entry_bytes, entries = struct.unpack_from("<HH", head, 58)
-    if len(head) < 64 or table + entry_bytes * entries > size:
-        os.unlink(path)

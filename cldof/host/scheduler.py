@@ -65,7 +65,7 @@ class _Command:
     label: str
 
 
-def compile(program: FrameProgram, device: Device) -> Batch:
+def compile(program: FrameProgram, device: Device, params: Mapping[str, Any] | None = None) -> Batch:
     """Make a frame program ready to run: check, build, allocate, upload constants, set what never changes.
 
     Parameters
@@ -73,6 +73,9 @@ def compile(program: FrameProgram, device: Device) -> Batch:
     program : FrameProgram
     device : Device
         Has to stay open as long as the batch.
+    params : mapping, optional
+        Of the first frame, as for :meth:`Batch.submit`: what the device has not built before is built and run with them
+        in a child process first (:mod:`cldof.host.trial`). Without them it is built here at once.
 
     Returns
     -------
@@ -86,8 +89,12 @@ def compile(program: FrameProgram, device: Device) -> Batch:
         A kernel does not compile.
     DeviceError
         The device lacks the memory or the work-group size.
+    DriverError
+        The driver died in that child process, or cannot build.
     """
     hazards.check(program)
+    if params is not None and device.trials is not None:
+        device.trials.program(program, params, device)
     with driver_errors(f"a frame cannot be made ready on {device.info.name}"):
         return Batch(program, device)
 
@@ -363,19 +370,23 @@ class FrameRing:
     device : Device
     slots : int
         The most frames in flight.
+    params : mapping, optional
+        Of the first frame; see :func:`compile`.
 
     Attributes
     ----------
     program : FrameProgram
     """
 
-    def __init__(self, program: FrameProgram, device: Device, slots: int = 2) -> None:
+    def __init__(
+        self, program: FrameProgram, device: Device, slots: int = 2, params: Mapping[str, Any] | None = None
+    ) -> None:
         if slots < 1:
             raise InputError(f"a frame ring of {slots} slots was asked for; it needs at least 1")
         self._slots = slots
         self.program = program
         # In the order of their last submission.
-        self.batches: deque[Batch] = deque([compile(program, device)])
+        self.batches: deque[Batch] = deque([compile(program, device, params)])
 
     def submit(
         self,

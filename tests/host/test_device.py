@@ -27,23 +27,23 @@ ALL = (POCL, LLVMPIPE, RADEON, GEFORCE)
     [(None, 2), (1, 1), ("1", 1), ("cpu", 0), ("GPU", 2), ("geforce", 3), ("nvidia", 3), ("llvm", 1), ("portable", 0)],
 )
 def test_choices(choice: int | str | None, index: int) -> None:
-    assert device_module._choose(ALL, choice) == index
+    assert device_module._candidates(ALL, choice)[0] == index
 
 
 def test_default_without_a_gpu_is_a_cpu_that_is_no_last_resort() -> None:
-    assert device_module._choose([replace(LLVMPIPE, index=0), replace(POCL, index=1)], None) == 1
-    assert device_module._choose([replace(LLVMPIPE, index=0)], None) == 0
+    assert device_module._candidates([replace(LLVMPIPE, index=0), replace(POCL, index=1)], None) == [1, 0]
+    assert device_module._candidates([replace(LLVMPIPE, index=0)], None) == [0]
 
 
 @pytest.mark.parametrize("choice", ["voodoo", 4, "-1", -1, "4"])
 def test_a_choice_that_matches_nothing_lists_what_there_is(choice: int | str) -> None:
     with pytest.raises(DeviceError, match=r"no OpenCL device matches .*0: pthread.*3: GeForce.*CLDOF_DEVICE"):
-        device_module._choose(ALL, choice)
+        device_module._candidates(ALL, choice)
 
 
 def test_no_device_says_how_to_get_one() -> None:
     with pytest.raises(DeviceError, match=r"pip install 'pyopencl\[pocl\]'"):
-        device_module._choose([], None)
+        device_module._candidates([], None)
 
 
 def test_listing(device: Device) -> None:

@@ -26,9 +26,9 @@ from cldof.errors import DeviceError
 from cldof.files import atomic_write
 from cldof.host import opencl as cl
 from cldof.host import program as program_module
+from cldof.host.caches import prepare_environment
 from cldof.host.device import DeviceInfo
 from cldof.host.program import ProgramCache
-from cldof.host.quirks import prepare_environment
 from cldof.images import save_image
 from tests.frames import noise_frame
 
@@ -359,25 +359,24 @@ def test_caches_shared_damaged_or_without_room(device_info: DeviceInfo, tmp_path
     for program in programs:
         os.truncate(program, program.stat().st_size // 2)
     again = _child(RENDER, cache)
-    assert again.communicate(timeout=120) == said.pop(), "programs cut short are made anew"
+    assert again.communicate(timeout=120) == (expected := said.pop()), "programs cut short are made anew"
     for source in cache.rglob("*.bc"):
         os.truncate(source, 0)
     for program in cache.rglob("*.so"):
         program.unlink()
     broken = _child(RENDER, cache)
-    _, error = broken.communicate(timeout=120)
-    assert broken.returncode == 1 and "DeviceError" in error
-    assert f"delete the cache in {cache}" in error.replace("\n", " ")
+    assert broken.communicate(timeout=120) == expected, "and so are programs without kernels"
 
 
 def test_a_disk_without_room_is_not_used_for_programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """PoCL's compiler ends the process when a file cannot be written to its end."""
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
     prepare_environment()
-    assert os.environ["POCL_CACHE_DIR"] == str(tmp_path)
+    assert Path(os.environ["POCL_CACHE_DIR"]).is_relative_to(tmp_path)
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr("shutil.disk_usage", lambda path: type("Usage", (), {"free": 1 << 20})())
     prepare_environment()
-    assert os.environ["POCL_CACHE_DIR"] != str(tmp_path)
+    assert not Path(os.environ["POCL_CACHE_DIR"]).is_relative_to(tmp_path)
 
 
 # Files that are written

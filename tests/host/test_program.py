@@ -11,6 +11,7 @@ import pytest
 from cldof.errors import BuildError, InputError
 from cldof.host import opencl as cl
 from cldof.host import program as program_module
+from cldof.host.caches import default_cache_dir
 from cldof.host.device import Device, DeviceInfo
 from cldof.host.program import ProgramCache, expand, numbered
 from cldof.host.quirks import Effect
@@ -207,10 +208,10 @@ def test_drivers_with_a_cache_get_no_second_one(device_info: DeviceInfo, device:
 
 def test_cache_directory_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("CLDOF_CACHE_DIR", str(tmp_path))
-    assert program_module.default_cache_dir() == tmp_path
+    assert default_cache_dir() == tmp_path
     monkeypatch.delenv("CLDOF_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert program_module.default_cache_dir() == tmp_path / "cldof"
+    assert default_cache_dir() == tmp_path / "cldof"
 
 
 def test_compiler_chatter_is_no_warning(cached: Callable[[], ProgramCache], sources: Path) -> None:

@@ -43,10 +43,17 @@ def iir(device: Device, image: np.ndarray, sigma: float) -> np.ndarray:
     extent = [np.int32(n) for n in (width, height, pitch)]
     shape = (height, pitch, 4)
     rows = run_pass(
-        device, "blur", "blur_iir_rows", [padded(image, pitch), sections, *extent], shape, (-(-height // (device.lanes // 4)),)
+        device,
+        "blur",
+        "blur_iir_rows",
+        [padded(image, pitch), sections, *extent],
+        shape,
+        (-(-height // (device.lanes // 4)),),
     )
     rows = padded(rows[:, :width], pitch)
-    out = run_pass(device, "blur", "blur_iir_columns", [rows, sections, *extent], shape, (-(-width // (device.lanes // 4)),))
+    out = run_pass(
+        device, "blur", "blur_iir_columns", [rows, sections, *extent], shape, (-(-width // (device.lanes // 4)),)
+    )
     return out[:, :width]
 
 
