@@ -6,7 +6,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
 from types import TracebackType
@@ -93,6 +93,11 @@ class DeviceInfo:
     global_mem_bytes: int
     platform_version: str = ""
     device_version: str = ""
+
+    @property
+    def identity(self) -> tuple[str, ...]:
+        """What stays the same from process to process; a driver may tell of less memory when there is less."""
+        return self.platform, self.platform_version, self.name, self.device_version, self.driver_version
 
     def __str__(self) -> str:
         return f"{self.index}: {self.name} ({self.kind}, {self.platform}, driver {self.driver_version})"
@@ -494,7 +499,7 @@ def _trials_of_adopted(device: Any) -> Trials | None:
     """The same for a device that the caller has opened, if a child can find it."""
     adopted = _info(-1, device)
     for info in list_devices():
-        if replace(info, index=-1) == adopted:
+        if info.identity == adopted.identity:
             return _trials(info, None)
     return None
 

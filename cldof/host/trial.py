@@ -117,9 +117,7 @@ class Trials:
 
     @cached_property
     def _identity(self) -> str:
-        info = self._info
-        parts = (info.platform, info.platform_version, info.name, info.device_version, info.driver_version)
-        return "\0".join((*parts, processor_digest()))
+        return "\0".join((*self._info.identity, processor_digest()))
 
     @property
     def _folder(self) -> Path:
@@ -225,7 +223,7 @@ def _carry_out(request: _Request, stage: Any) -> None:
 
     stage("opening the device")
     with Device.open(request.device.index, sources=request.sources, lanes=request.lanes) as device:
-        if device.info != request.device:
+        if device.info.identity != request.device.identity:
             raise DeviceError(f"device {request.device} is {device.info} in another process")
         if request.program is None:
             stage("trying a small kernel")
