@@ -312,12 +312,11 @@ def _bench(arguments: argparse.Namespace) -> None:
 
 def _devices(arguments: argparse.Namespace) -> None:
     from .host.device import list_devices
+    from .host.drivers import driver_advice
 
     devices = list_devices()
     if not devices:
-        raise DeviceError(
-            "No OpenCL device found. Any driver will do: a GPU's own, or for the CPU pip install 'pyopencl[pocl]'."
-        )
+        raise DeviceError(f"No OpenCL device found. Any driver will do: a GPU's own, or for the CPU {driver_advice()}.")
     for device in devices:
         memory = f"{device.compute_units} compute units, {device.global_mem_bytes / 2**30:.1f} GiB"
         print(f"{device.index}  {device.name}\n   {device.kind}, {device.platform}, {device.driver_version}, {memory}")

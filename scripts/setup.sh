@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
 # Make .venv ready, from nothing: setup.sh core|test|dev|bench|oclgrind|rusticl
 #
-# Installs what is missing and no more; a second run is instant. Uses apt-get (with sudo when not root) for three
-# things that pip cannot bring: Python's own venv module, what PoCL links its kernels with, and an EGL/OpenGL driver.
+# Installs what is missing and no more; a second run is instant. Uses apt-get (with sudo when not root) for what pip
+# cannot bring: Python's own venv module, what PoCL links its kernels with, a PoCL where pip has none that works here, and
+# an EGL/OpenGL driver.
 # Where apt-get or the right to use it is missing it says what to install and goes on if it can.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -12,6 +13,7 @@ venv=.venv
 stamp=$venv/.cldof-$extra
 cl_stamp=$venv/.cldof-cl
 gl_stamp=$venv/.cldof-gl
+system_pocl_stamp=$venv/.cldof-system-pocl
 
 say() { printf '%s\n' "cldof setup: $*" >&2; }
 fail() { say "$*"; exit 1; }
@@ -74,6 +76,8 @@ oclgrind) command -v oclgrind >/dev/null || apt_install oclgrind || say "oclgrin
 rusticl) apt_install mesa-opencl-icd || say "mesa-opencl-icd cannot be installed"; exit 0 ;;
 esac
 
+drop_pip_pocl() { "$venv/bin/python" -m pip uninstall -qq -y --disable-pip-version-check pocl-binary-distribution; }
+
 # An existing .venv whose interpreter is gone (an upgrade of the system, a moved folder) is made anew.
 "$venv/bin/python" -c 'import pip' 2>/dev/null || make_venv
 
@@ -82,6 +86,7 @@ if [ ! -e "$stamp" ] || [ setup.cfg -nt "$stamp" ] || [ pyproject.toml -nt "$sta
     [ "$extra" = core ] || target=".[$extra]"
     say "installing cldof and what it needs into $venv (once, a few minutes on a slow line)"
     "$venv/bin/python" -m pip install -qq --disable-pip-version-check -e "$target"
+    [ ! -e "$system_pocl_stamp" ] || drop_pip_pocl
     touch "$stamp"
 fi
 
@@ -91,14 +96,26 @@ have_cl() { prove 'from cldof.host.device import Device; Device.open().traits' c
 have_gl() { prove 'from cldof.capture.peel import DepthPeeler; DepthPeeler(8, 8).close()' gl; }
 why() { tail -n 1 "$venv/$1.log"; }
 
-# PoCL, the OpenCL driver that pip brings, links each kernel against libgcc and libc with the system's ld, and aborts the
-# process where one of them is missing.
+# The distribution's PoCL in place of pip's. The first probe sees that driver alone: pip's is removed only for one that
+# works, since with both present the one that fails may be the one that is chosen.
+use_system_pocl() {
+    local icd=/etc/OpenCL/vendors/pocl.icd
+    [ -e "$icd" ] || apt_install pocl-opencl-icd || return 1
+    OCL_ICD_VENDORS=$icd have_cl || return 1
+    drop_pip_pocl
+    touch "$system_pocl_stamp"
+    have_cl
+}
+
+# PoCL links each kernel against libgcc and libc with the system's ld, and aborts the process where one of them is missing.
+# pip has no PoCL for Arm, and its LLVM 14 cannot compile for processors that it cannot name ("unknown target CPU").
 if [ ! -e "$cl_stamp" ]; then
-    if have_cl || { apt_install gcc libc6-dev && have_cl; }; then
+    if have_cl || { apt_install gcc libc6-dev && have_cl; } || use_system_pocl; then
         touch "$cl_stamp"
     else
         say "no OpenCL device works here ($(why cl)): nothing can be rendered;" \
-            "for PoCL on the CPU install gcc and libc6-dev, for a GPU its driver."
+            "for PoCL on the CPU install gcc and libc6-dev, and pocl-opencl-icd where pip's PoCL does not work;" \
+            "for a GPU its driver."
     fi
 fi
 

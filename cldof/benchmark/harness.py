@@ -27,6 +27,7 @@ from ..capture.reference_cache import ReferenceCache
 from ..errors import CldofError, InputError
 from ..frame import LayeredFrame
 from ..host.device import Device, DeviceInfo, list_devices
+from ..host.drivers import driver_advice
 from ..host.profile import copy_baseline
 from ..lens import Lens
 from ..method_options import shades_surfaces
@@ -186,7 +187,7 @@ def choose_devices(choices: Sequence[str | int]) -> list[DeviceInfo]:
     found = list_devices()
     if not choices:
         if not found:
-            raise InputError("No OpenCL device found; pip install 'pyopencl[pocl]' brings one for the CPU.")
+            raise InputError(f"No OpenCL device found. For the CPU {driver_advice()}.")
         return found
     indices = []
     for choice in choices:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..errors import BuildError, DeviceError, DriverError, DriverWarning
 from . import opencl as cl
 from .buffers import BufferPool
+from .drivers import driver_advice
 from .lanes import LANES, PROBE_SOURCE, lanes_for
 from .launch import launch
 from .program import ProgramCache, SourceDirectory
@@ -512,8 +513,7 @@ def _candidates(infos: Sequence[DeviceInfo], choice: int | str | None) -> list[i
     """Indices of the devices that a choice may mean, the best first; pure, so that it can be tested without devices."""
     if not infos:
         raise DeviceError(
-            "no OpenCL device was found. Any driver will do: a GPU's own, or for the CPU "
-            "pip install 'pyopencl[pocl]', which needs nothing else."
+            f"no OpenCL device was found. Any driver will do: a GPU's own, or for the CPU {driver_advice()}."
         )
     if isinstance(choice, str) and choice.strip().lstrip("-").isdigit():
         choice = int(choice)

@@ -12,18 +12,19 @@ from typing import Any
 
 from ..errors import DeviceError
 from .caches import prepare_environment
+from .drivers import driver_advice, prepare_drivers
 
 
 def __getattr__(name: str) -> Any:
     if name.startswith("__"):  # the import system probes for these
         raise AttributeError(name)
     prepare_environment()
+    prepare_drivers()
     try:
         pyopencl = import_module("pyopencl")
     except ImportError as error:
         raise DeviceError(
-            f"pyopencl cannot be imported ({error}). Install it with a CPU driver that needs nothing else: "
-            f"pip install 'pyopencl[pocl]'"
+            f"pyopencl cannot be imported ({error}). Install it with a driver for the CPU: {driver_advice()}."
         ) from error
     value = getattr(pyopencl, name)
     globals()[name] = value  # the next look-up is a plain module attribute
