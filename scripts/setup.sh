@@ -2,8 +2,8 @@
 # Make .venv ready, from nothing: setup.sh core|test|dev|bench|oclgrind|rusticl
 #
 # Installs what is missing and no more; a second run is instant. Uses apt-get (with sudo when not root) for what pip
-# cannot bring: Python's own venv module, what PoCL links its kernels with, a PoCL where pip has none that works here, and
-# an EGL/OpenGL driver.
+# cannot bring: Python's own venv module, what PoCL links its kernels with, a PoCL where pip has none that works here, an
+# EGL/OpenGL driver, and for `test` a clang, through which kernels are compiled for other processors.
 # Where apt-get or the right to use it is missing it says what to install and goes on if it can.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -14,6 +14,7 @@ stamp=$venv/.cldof-$extra
 cl_stamp=$venv/.cldof-cl
 gl_stamp=$venv/.cldof-gl
 system_pocl_stamp=$venv/.cldof-system-pocl
+clang_stamp=$venv/.cldof-clang
 
 say() { printf '%s\n' "cldof setup: $*" >&2; }
 fail() { say "$*"; exit 1; }
@@ -126,4 +127,12 @@ if [ ! -e "$gl_stamp" ]; then
         say "no offscreen OpenGL here: scenes cannot be captured; frames of your own (.npz, arrays) still render." \
             "The probe ended with: $(why gl)"
     fi
+fi
+
+have_clang() { "$venv/bin/python" -c 'from tests.tools.compiled import find_clang; raise SystemExit(not find_clang())'; }
+
+if [ "$extra" = test ] && [ ! -e "$clang_stamp" ]; then
+    have_clang || { apt_install clang && have_clang; } ||
+        say "no clang that knows OpenCL C: kernels are not checked for other processors; install clang."
+    touch "$clang_stamp" # asked once; tests find a clang that comes later by themselves
 fi

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,12 @@ from cldof import Camera, LayeredFrame, Lens, Renderer
 from cldof.host import opencl as cl
 from cldof.host.device import Device, Traits
 from cldof.host.program import BUILD_OPTIONS, Defines, SourceDirectory, expand
-from cldof.methods import gaussian
+from cldof.methods import FrameShape, gaussian, make_method
+from cldof.planner import BINS, MAX_CHANGE, SceneStats, bin_scale, everything, plan_frame, planned_program
+from cldof.renderer import _image_size, _preparation_program, _Resolve, _resolved, _supersampled
 from tests.frames import noise_frame
 from tests.kernels import test_blur as blur
+from tests.oracles.stats import tile_stats
 from tests.shaded import shaded_frame
 
 __all__ = ["CASES", "Case", "FilledSources", "Program", "kernels_in_sources", "record_kernels", "unset_variables"]
@@ -68,6 +72,27 @@ class Case:
         frame = FRAMES[self.frame]()
         return renderer.render(frame, Lens(self.coc_px / frame.camera.focal_px, 2.0)).image
 
+    def programs(self, traits: Traits) -> set[Program]:
+        """Those that a device with such traits builds for it; without a device."""
+        if self.method == "blur":
+            return {("blur", ())}
+        frame = _frame(self.frame)
+        shape = FrameShape.of(frame)
+        lens = Lens(self.coc_px / frame.camera.focal_px, 2.0)
+        factor, antialias = self.renderer.get("supersample", 1), self.renderer.get("antialias", True)
+        is_planned = self.renderer.get("planned", True)
+        method = _supersampled(make_method(self.method, **self.options), factor, antialias)
+        if is_planned:
+            plan = plan_frame(method, frame, lens, _stats_of(self.frame), traits, MAX_CHANGE)
+        else:
+            plan = everything(method, frame, lens)
+        passes = list(_preparation_program(shape, traits.is_cpu, is_planned).passes)
+        program = planned_program(method, shape, plan, traits)
+        left = factor // getattr(method, "supersample", 1)
+        if left > 1:
+            program = _resolved(program, _Resolve(left, _image_size(shape, factor), antialias))
+        return {(one.source, tuple(one.defines)) for one in (*passes, *program.passes)}
+
 
 def _blurred(device: Device) -> np.ndarray:
     """blur.cl by itself: no method calls it."""
@@ -102,6 +127,36 @@ FRAMES: dict[str, Callable[[], LayeredFrame]] = {
     "scattered": _scattered,
     "shaded": lambda: shaded_frame(WIDTH, HEIGHT),
 }
+
+
+@cache
+def _frame(name: str) -> LayeredFrame:
+    return FRAMES[name]()
+
+
+@cache
+def _stats_of(name: str) -> SceneStats:
+    """What the statistics' kernels find, by their float64 twin."""
+    frame = _frame(name)
+    first, scale = bin_scale(frame)
+    found = tile_stats(frame)
+    bins = found.pop("bins")
+    return SceneStats(
+        shape=FrameShape.of(frame),
+        **{key: value.astype(np.float32) for key, value in found.items()},
+        bins=(bins.astype(np.uint64) << np.arange(BINS, dtype=np.uint64)).sum(axis=-1, dtype=np.uint64),
+        histogram=_histogram(frame, first, scale),
+        first=first,
+        last=first + BINS / scale if scale else first,
+    )
+
+
+def _histogram(frame: LayeredFrame, first: float, scale: float) -> np.ndarray:
+    is_there = frame.color[..., 3] > 0.0
+    number = np.clip((1.0 / frame.depth - first) * scale, 0, BINS - 1).astype(int)
+    return np.stack([np.bincount(number[m][is_there[m]], minlength=BINS) for m in range(frame.layer_count)]).astype(
+        float
+    )
 
 
 def _cases() -> Iterator[Case]:

@@ -64,6 +64,16 @@ def test_no_kernel_was_left_out(seen: set[str], canaried: Device, request: pytes
     assert not missing, "a new kernel needs a case in tests/every_kernel.py"
 
 
+def test_the_programs_are_known_without_a_device(
+    programs: set[Program], canaried: Device, request: pytest.FixtureRequest
+) -> None:
+    """What tests/test_portable_kernels.py compiles for other processors is what was built here."""
+    if sum(item.name.startswith("test_memory") for item in request.session.items) < len(CASES):
+        pytest.skip("only some of the cases were run")
+    expected = set().union(*(case.programs(canaried.traits) for case in CASES if not case.lacks(canaried.traits)))
+    assert programs == expected
+
+
 FAULTS = {
     "float x; if (n > 3) x = 2.0f; o[0] = x;": "'x'",
     "float x; for (int i = 0; i < n; i++) x = i; o[0] = x;": "'x'",
