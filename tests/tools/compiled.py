@@ -4,10 +4,9 @@
 Nothing is run and no OpenCL driver is needed: forms say which programs they are made of
 (:meth:`tests.every_kernel.Case.programs`).
 
-Drivers that crashed had calls of *library* functions that pass or return vectors of 64 bytes in code for a processor
-without AVX-512. What a program is is the same for all of them, so one look at clang's intermediate code shows such calls
-on any machine. Helpers of a program that take a vector wider than the processor's registers make clang warn
-(``-Wpsabi``), which drivers print or count.
+Drivers crash over calls of *library* functions that pass or return vectors of 64 bytes, in code for a processor without
+AVX-512. Clang's intermediate code shows such calls on any machine. Helpers of a program that take a vector wider than the
+processor's registers make clang warn (``-Wpsabi``), which drivers print or count.
 """
 
 from __future__ import annotations
