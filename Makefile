@@ -7,13 +7,14 @@ ARGS ?=
 
 export PYTHON
 
-.PHONY: help demo test test-devices test-oclgrind stability mutants bench lint clean
+.PHONY: help demo test test-devices test-cpus test-oclgrind stability mutants bench lint clean
 
 help:
 	@echo "make demo   render a built-in scene to out/demo.png (and out/demo-pinhole.png beside it)"
 	@echo "make test   run all tests          (ARGS='-k lens' picks some)"
 	@echo "make stability  hard cases on every device, measured into docs/stability.md"
 	@echo "make test-devices   the kernel and method tests on every OpenCL driver that can be installed, and how they agree"
+	@echo "make test-cpus      every kernel as other x86-64 processors and Debian's PoCL have it (under 15 minutes)"
 	@echo "make test-oclgrind  every kernel under a simulator that checks each access to memory (minutes)"
 	@echo "make mutants        faults put into the kernels: how many the tests notice (an hour)"
 	@echo "make bench  speed of each pass, then accuracy and time of every method, quickly (4 minutes)"
@@ -40,6 +41,12 @@ stability:
 test-devices:
 	@scripts/setup.sh test
 	@scripts/devices.sh $(ARGS)
+
+# Processors that this machine is not: compiled by the system's clang, then by PoCL, which is told that it runs there.
+test-cpus:
+	@scripts/setup.sh test
+	$(VENV)/python -m tests.tools.compiled
+	$(VENV)/python -m tests.tools.processors $(ARGS)
 
 test-oclgrind:
 	@scripts/setup.sh test

@@ -5,8 +5,8 @@ Nothing is run and no OpenCL driver is needed: forms say which programs they are
 (:meth:`tests.every_kernel.Case.programs`).
 
 Drivers crash over calls of *library* functions that pass or return vectors of 64 bytes, in code for a processor without
-AVX-512. Clang's intermediate code shows such calls on any machine. Helpers of a program that take a vector wider than the
-processor's registers make clang warn (``-Wpsabi``), which drivers print or count.
+AVX-512. Clang's intermediate code shows such calls on any machine. Helpers of a program that take a vector wider than
+the processor's registers make clang warn (``-Wpsabi``), which drivers print or count.
 """
 
 from __future__ import annotations

@@ -44,8 +44,8 @@ _POCL = "Portable Computing Language"
 _LIMIT_S = 1200
 _MOST_SHOWN = 20
 
-# Without fused multiply-adds, or with sums in another order, pixels differ by rounding; where a sample lands on the other
-# side of an edge, or a tie is decided the other way, one differs by more.
+# Without fused multiply-adds, or with sums in another order, pixels differ by rounding; where a sample lands on the
+# other side of an edge, or a tie is decided the other way, one differs by more.
 CLOSE = 1e-3
 MOST_FARTHER = 0.005
 
@@ -192,9 +192,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if len(problems) > _MOST_SHOWN:
         print(f"... and {len(problems) - _MOST_SHOWN} more")
     minutes = (time.perf_counter() - started) / 60.0
-    print(
-        f"{len(rows)} legs, {problems.total()} problems, {minutes:.1f} min on {os.cpu_count()} processors: {_processor()}"
-    )
+    machine = f"{os.cpu_count()} processors: {_processor()}"
+    print(f"{len(rows)} legs, {problems.total()} problems, {minutes:.1f} min on {machine}")
     if options.json:
         record = {"processor": _processor(), "minutes": round(minutes, 1), "legs": rows}
         options.json.write_text(json.dumps(record, indent=1) + "\n")
