@@ -7,6 +7,7 @@ planned` tells what planning is worth, `python -m bench racks` whether focus may
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 
 from cldof.benchmark.command import add_arguments, bench
@@ -23,12 +24,30 @@ def main() -> int:
         if sys.argv[1:2] == ["speed"]:
             parser = argparse.ArgumentParser(
                 prog="bench speed",
-                description="Speed of the layered method and of its blurs, as ratios to a device copy.",
+                description="Speed of frames and of blurs, as ratios to OpenCV's Gaussian blur of sigma 16.",
             )
             parser.add_argument("--device", help="index, cpu, gpu or part of a name (as cldof render --device)")
             parser.add_argument("--runs", type=int, default=30, help="frames to time (default 30)")
+            parser.add_argument("--sizes", nargs="+", default=["1024x1024"], help="WxH, 1080p, 4K (default 1024x1024)")
+            parser.add_argument("--methods", nargs="+", default=["layered"], help="default: layered")
+            parser.add_argument(
+                "--seconds",
+                type=float,
+                default=math.inf,
+                help="for the frames of a method at a size (default: no limit)",
+            )
+            parser.add_argument("--no-blurs", action="store_true", help="frames alone, no table of blurs")
+            parser.add_argument("--output", metavar="FILE", help="keep the numbers as JSON")
             arguments = parser.parse_args(sys.argv[2:])
-            speed.report(arguments.device, max(arguments.runs, 3))
+            speed.report(
+                arguments.device,
+                max(arguments.runs, 3),
+                [speed.parse_size(size) for size in arguments.sizes],
+                arguments.methods,
+                arguments.seconds,
+                not arguments.no_blurs,
+                arguments.output,
+            )
             return 0
         if sys.argv[1:2] == ["auto"]:
             parser = argparse.ArgumentParser(prog="bench auto", description="How method='auto' keeps its budgets.")

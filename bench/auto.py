@@ -9,7 +9,8 @@ bench/results/auto-tuning.json are of other lenses and sizes. There are two tabl
 with models that for every scene are made anew from the others, as for a scene that nobody has measured. The device's
 times come from the run itself, by a fit that leaves out the lens in the first table and the scene in the second.
 
-Times: frames of 512x512 of every scene, by a renderer of its own for each budget.
+Times: frames of 512x512 of every scene, by a renderer of its own for each budget, which is so many of OpenCV's blurs
+(:mod:`cldof.benchmark.unit`).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from cldof import BudgetWarning, LayeredFrame, Lens, Renderer
 from cldof.auto import Budget, Chooser, Curves, Setting, cache_folder, features
+from cldof.benchmark.unit import Unit, Yardstick
 from cldof.capture.peel import DepthPeeler
 from cldof.capture.reference_cache import ReferenceCache
 from cldof.capture.scene import Scene
@@ -54,7 +56,9 @@ SCENES = (
 )  # fmt: skip
 SIZE, LARGE, LOOK = 256, 512, 192
 TARGETS_DB = (24, 26, 28, 30, 32, 34)
-BUDGETS_COPIES = (8, 12, 20, 40, 80)
+# Of times, in OpenCV's blurs, and in copies of 16 MB where there is no OpenCV: about the same on most machines.
+BUDGETS_BLURS = (0.2, 0.3, 0.5, 1.0, 2.0)
+BUDGETS_COPIES = (8.0, 12.0, 20.0, 40.0, 80.0)
 # A fixed setting meets a target when it does in this share of the cases.
 MOST = 0.95
 
@@ -172,17 +176,25 @@ def judge_errors(cases: list[Case], unit_ms: float, left_out: bool) -> list[str]
     return lines
 
 
-def judge_times(device: Any, busy: bool, unit_ms: float, scenes: tuple[str, ...]) -> list[str]:
+def budgets(unit: Unit, busy: bool) -> dict[str, float]:
+    """Milliseconds of each budget, and how the table calls it; ``busy`` as for frames: a blur that has the machine."""
+    if unit.blur is None:
+        assert unit.copy is not None
+        return {f"{copies:g} copies": copies * unit.copy.min for copies in BUDGETS_COPIES}
+    alone = unit.blur.cpu_min / unit.threads if busy and unit.blur.cpu_min else unit.blur.median
+    return {f"{blurs:g}": blurs * alone for blurs in BUDGETS_BLURS}
+
+
+def judge_times(device: Any, busy: bool, unit: Unit, scenes: tuple[str, ...]) -> list[str]:
     """The table for max_ms: the first choice alone, and after ten frames that it learns from."""
     lines = [
-        "| max_ms, copies | attainable | kept, first choice | kept, after 10 frames | mean share of the time used |",
+        "| max_ms, blurs | attainable | kept, first choice | kept, after 10 frames | mean share of the time used |",
         "|---|---|---|---|---|",
     ]
     with DepthPeeler() as peeler:  # open as long as frames may ask for finer ones
         shots = list(_shots(peeler, scenes))
         quickest = [min(_setting_ms(device, one, frame, lens, busy) for one in LADDER[:4]) for frame, lens in shots]
-        for copies in BUDGETS_COPIES:
-            budget = copies * unit_ms
+        for name, budget in budgets(unit, busy).items():
             first, later, used = [], [], []
             for (frame, lens), least in zip(shots, quickest, strict=True):
                 if least > budget:
@@ -199,7 +211,7 @@ def judge_times(device: Any, busy: bool, unit_ms: float, scenes: tuple[str, ...]
                 used.append(took / budget)
             if first:
                 lines.append(
-                    f"| {copies} ({budget:.1f} ms) | {len(first)} of {len(shots)} | {np.mean(first):.0%} | "
+                    f"| {name} ({budget:.1f} ms) | {len(first)} of {len(shots)} | {np.mean(first):.0%} | "
                     f"{np.mean(later):.0%} | {np.mean(used):.0%} |"
                 )
     return lines
@@ -231,9 +243,11 @@ def report(
     size: int = SIZE,
 ) -> None:
     """Measure and print the tables."""
-    with Renderer(device=device) as renderer:
-        unit = copy_ms(renderer.device, busy)
-        print(f"{renderer.device.info}, copy of 16 MB {unit:.3f} ms")
+    with Renderer(device=device) as renderer, Yardstick(renderer.device) as yardstick:
+        unit = yardstick.measure({}, 20).unit
+        # What predictions are in, as in a renderer that has no OpenCV; it cancels out here.
+        unit_ms = copy_ms(renderer.device, busy)
+        print(f"{renderer.device.info}\n{unit}")
     cases = list(measured_cases(device, busy, scenes, size))
     if output:
         rows = [
@@ -248,12 +262,12 @@ def report(
             for c in cases
         ]
         Path(output).write_text(json.dumps({"settings": [str(one) for one in LADDER], "cases": rows}) + "\n")
-    _, margin = fit_times([TimeRow(case.feature, case.ms / unit) for case in cases])
+    _, margin = fit_times([TimeRow(case.feature, case.ms / unit_ms) for case in cases])
     most = ", ".join(f"{one} {math.exp(each):.1f}" for one, each in zip(LADDER, margin, strict=True))
     print(f"\n95 % of the times of scenes that are left out stay below so many times the prediction: {most}.\n")
     print("Scenes that are known, through other lenses:\n")
-    print("\n".join(judge_errors(cases, unit, left_out=False)))
+    print("\n".join(judge_errors(cases, unit_ms, left_out=False)))
     print("\nScenes that are not known:\n")
-    print("\n".join(judge_errors(cases, unit, left_out=True)))
+    print("\n".join(judge_errors(cases, unit_ms, left_out=True)))
     print("\nmax_ms:\n")
     print("\n".join(judge_times(device, busy, unit, scenes)))

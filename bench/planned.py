@@ -1,25 +1,26 @@
 """What planning is worth: the time of scenes that call for little, as ratios to one that calls for everything.
 
 Scenes are textured walls with boxes before them and windows through them. Times are processor time of the passes, all
-threads together, the least of several frames, so that other work on the machine does not count; the unit is a copy of
-16 MB on the device in the same run.
+threads together, the least of several frames, so that other work on the machine does not count (on a GPU the clock's).
+Units are those of :mod:`cldof.benchmark.unit`, between the frames: OpenCV's blur, and a copy of 16 MB on the device.
 """
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cldof import Camera, LayeredFrame, Lens, Renderer
-from cldof.host import opencl as cl
+from cldof.benchmark.times import Times
+from cldof.benchmark.unit import MISSING, Measured, Yardstick, opencv_blur
 from cldof.methods import METHODS
 
-__all__ = ["CASES", "make_frame", "measure", "report"]
+__all__ = ["CASES", "least", "make_frame", "measure", "milliseconds", "report"]
 
 Box = tuple[float, float, float, float, float]
 
@@ -59,42 +60,25 @@ def make_frame(size: int, boxes: list[Box], wall_m: float) -> LayeredFrame:
     return LayeredFrame(color, depth, Camera(size, size, 40.0))
 
 
-def _least(run: Callable[[], Any], times: int) -> float:
-    """Processor time in ms."""
-    run()
-    taken = []
-    for _ in range(times):
-        start = time.process_time()
-        run()
-        taken.append(time.process_time() - start)
-    return min(taken) * 1e3
-
-
-def _copy_ms(renderer: Renderer, times: int) -> float:
-    pool, queue = renderer.device.pool, renderer.device.queue
-    nbytes = 16 << 20
-    source, target = pool.acquire(nbytes), pool.acquire(nbytes)
-    cl.enqueue_fill_buffer(queue, source, b"\0\0\0\0", 0, nbytes).wait()
-    taken = _least(lambda: cl.enqueue_copy(queue, target, source, byte_count=nbytes).wait(), 4 * times)
-    pool.release(source)
-    pool.release(target)
-    return taken
-
-
 def measure(method: str, device: str | None, size: int, times: int) -> list[dict[str, Any]]:
-    """One row per case: milliseconds planned and not, for a frame known already and for a new one."""
+    """One row per case: milliseconds planned and not, for a frame known already and for a new one, and the unit's."""
     rows = []
     out = np.empty((size, size, 4), np.float32)
-    with Renderer(method, device=device) as on, Renderer(method, device=device, planned=False) as off:
-        copy = _copy_ms(on, times)
+    with (
+        Renderer(method, device=device) as on,
+        Renderer(method, device=device, planned=False) as off,
+        Yardstick(on.device) as yardstick,
+    ):
         # What comes after the passes: the image on its way to the host.
         target = on.device.pool.acquire(out.nbytes)
-        download = _least(lambda: on.device.pool.download(target, out).wait(), 4 * times)
         for case, (boxes, wall, focus) in CASES.items():
             frame = make_frame(size, boxes, wall)
             lens = Lens(_COC_PX * size / 1024 * 2.0 / frame.camera.focal_px, focus)
             plan = on.render(frame, lens).plan
             change = float(np.abs(on.render(frame, lens).image - off.render(frame, lens).image).max())
+
+            def known(renderer: Renderer, frame: LayeredFrame = frame, lens: Lens = lens) -> Callable[[], Any]:
+                return lambda: renderer.render(frame, lens, out=out)
 
             def new(renderer: Renderer, frame: LayeredFrame = frame, lens: Lens = lens) -> Callable[[], Any]:
                 fresh = []
@@ -104,15 +88,22 @@ def measure(method: str, device: str | None, size: int, times: int) -> list[dict
                     fresh.append(one)
                 return lambda: renderer.render(fresh.pop(), lens, out=out)
 
+            measured = yardstick.measure(
+                {
+                    "download": lambda: on.device.pool.download(target, out).wait(),
+                    "planned_ms": known(on),
+                    "everything_ms": known(off),
+                    "planned_new_ms": new(on),
+                    "everything_new_ms": new(off),
+                },
+                times,
+            )
             rows.append(
                 {
                     "method": method,
                     "case": case,
-                    "copy_ms": copy,
-                    "planned_ms": _least(lambda r=on, f=frame, v=lens: r.render(f, v, out=out), times) - download,
-                    "everything_ms": _least(lambda r=off, f=frame, v=lens: r.render(f, v, out=out), times) - download,
-                    "planned_new_ms": _least(new(on), times) - download,
-                    "everything_new_ms": _least(new(off), times) - download,
+                    "unit": asdict(measured.unit),
+                    **milliseconds(measured),
                     "windows": plan.summary["windows"],
                     "error_bound": plan.error_bound,
                     "change": change,
@@ -121,22 +112,42 @@ def measure(method: str, device: str | None, size: int, times: int) -> list[dict
     return rows
 
 
+def milliseconds(measured: Measured) -> dict[str, float | None]:
+    """The least of everything: processor time, or the clock's on a device that is no CPU; downloads are taken off."""
+    unit, times = measured.unit, dict(measured.times)
+    download = least(times.pop("download"))
+    return {
+        "blur_ms": least(unit.blur, times["planned_ms"].cpu is not None) if unit.blur else None,
+        "copy_ms": least(unit.copy) if unit.copy else None,
+        **{name: least(one) - download for name, one in times.items()},
+    }
+
+
+def least(times: Times, by_processor: bool = True) -> float:
+    """Processor time, all threads together, where it is known and wanted; else the clock's."""
+    return times.min if times.cpu_min is None or not by_processor else times.cpu_min
+
+
 def report(device: str | None, size: int, times: int, output: str | None) -> None:
     """Measure every method, print a table, and keep the numbers."""
+    if opencv_blur()[0] is None:
+        print(MISSING)
     rows = [row for method in sorted(METHODS) for row in measure(method, device, size, times)]
     print(
-        "| method | scene | copies | of the full scene | of everything on | new frame: copies "
-        "| new frame: of everything on |\n|---|---|---|---|---|---|---|"
+        "| method | scene | blurs | copies | of the full scene | of everything on "
+        "| new frame: blurs | new frame: copies | new frame: of everything on |\n|---|---|---|---|---|---|---|---|---|"
     )
     for row in rows:
         full = next(one for one in rows if one["method"] == row["method"] and one["case"] == "full")
         cells = (
             f"`{row['method']}`",
             row["case"],
-            f"{row['planned_ms'] / row['copy_ms']:.1f}",
+            _over(row["planned_ms"], row["blur_ms"], ".3f"),
+            _over(row["planned_ms"], row["copy_ms"], ".1f"),
             f"{row['planned_ms'] / full['planned_ms']:.0%}",
             f"{row['planned_ms'] / row['everything_ms']:.0%}",
-            f"{row['planned_new_ms'] / row['copy_ms']:.1f}",
+            _over(row["planned_new_ms"], row["blur_ms"], ".3f"),
+            _over(row["planned_new_ms"], row["copy_ms"], ".1f"),
             f"{row['planned_new_ms'] / row['everything_new_ms']:.0%}",
         )
         print("| " + " | ".join(cells) + " |")
@@ -144,3 +155,7 @@ def report(device: str | None, size: int, times: int, output: str | None) -> Non
     print(f"\nLargest change of a pixel: {largest['change']:.1g} ({largest['method']}, {largest['case']}).")
     if output:
         Path(output).write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+
+
+def _over(ms: float, unit_ms: float | None, form: str) -> str:
+    return format(ms / unit_ms, form) if unit_ms else "-"

@@ -12,6 +12,7 @@ import numpy as np
 
 from .ladders import ACCUMULATION
 from .record import Record, Row
+from .unit import MISSING
 
 __all__ = [
     "Column",
@@ -22,6 +23,7 @@ __all__ = [
     "layered_table",
     "summary_table",
     "text_table",
+    "unit_text",
 ]
 
 
@@ -130,6 +132,12 @@ def columns(many_devices: bool = True) -> tuple[Column, ...]:
         Column("least", "the quickest of those frames, ms", lambda _, row: row.wall and row.wall.min, ".1f"),
         Column(
             "IQR", "distance between the quartiles of those frames, ms", lambda _, row: row.wall and row.wall.iqr, ".2f"
+        ),
+        Column(
+            "blurs",
+            "frame in OpenCV blurs of sigma 16, 1024x1024, timed between its runs; (cpu): by processor time, as the "
+            "machine was not idle",
+            lambda _, row: None if row.in_blurs is None else str(row.in_blurs),
         ),
         Column("kernels", "sum of the passes, ms", lambda _, row: _median(row.kernels), ".1f"),
         Column("copies", "kernels in device copies of 16 MB", lambda _, row: row.kernels_in_copies, ".1f"),
@@ -242,6 +250,7 @@ def summary_table(record: Record, unlit: bool = False) -> tuple[list[str], list[
         "total ms",
         "CPU ms",
         "frame ms",
+        "blurs",
         "PSNR dB",
         "worst",
         "SSIM",
@@ -272,6 +281,7 @@ def summary_table(record: Record, unlit: bool = False) -> tuple[list[str], list[
                 _middle([row.total_ms for row in rows], ".1f"),
                 _middle(_known(row.cpu_ms for row in rows), ".0f"),
                 _middle([row.wall.median for row in rows if row.wall], ".1f"),
+                _middle([row.in_blurs.value for row in rows if row.in_blurs], ".3g"),
                 _middle(_known(row.error("psnr_db") for row in rows), ".2f"),
                 _least(_known(row.error("psnr_db") for row in rows), ".2f"),
                 _middle(_known(row.error("ssim") for row in rows), ".4f"),
@@ -280,6 +290,24 @@ def summary_table(record: Record, unlit: bool = False) -> tuple[list[str], list[
             ]
         )
     return heads, cells
+
+
+def unit_text(record: Record) -> str:
+    """What speeds of a record are judged by, and how far that scattered from row to row."""
+    units = [row.unit for row in record.rows.values() if row.unit and row.unit.blur]
+    if not units:
+        if record.rows and all(row.unit is None for row in record.rows.values()):
+            return (
+                "An older record: speeds in copies of 16 MB alone, which scatter by a factor of four on some machines."
+            )
+        return MISSING + "."
+    wall = [unit.blur.median for unit in units if unit.blur]
+    cpu = [unit.blur.cpu for unit in units if unit.blur and unit.blur.cpu]
+    busy = sum(not unit.is_quiet for unit in units)
+    text = f"Unit: {units[0].what}. Medians of {len(units)} rows: {min(wall):.1f} to {max(wall):.1f} ms by the clock"
+    if cpu:
+        text += f", {min(cpu):.1f} to {max(cpu):.1f} ms of processor time"
+    return f"{text}; the machine was not idle in {busy} of them, which are judged by processor time."
 
 
 def _known(values: Iterable[float | None]) -> list[float]:

@@ -20,7 +20,7 @@ from ..capture.reference_cache import ReferenceCache
 from ..capture.scene import Scene
 from ..frame import LayeredFrame
 from ..lens import Lens
-from .record import Times
+from .times import Times
 
 __all__ = ["Case", "CaseKey"]
 

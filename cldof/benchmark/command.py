@@ -114,7 +114,7 @@ def _size(text: str) -> tuple[int, int]:
 
 def report(record: Record, folder: Path) -> None:
     """Print the tables; write plots and page into the folder."""
-    from .analysis import case_table, summary_table, text_table
+    from .analysis import case_table, summary_table, text_table, unit_text
     from .page import save_page
     from .plots import has_matplotlib, save_plots
 
@@ -128,6 +128,7 @@ def report(record: Record, folder: Path) -> None:
         if cells:
             print(f"\n== medians over the scenes{' with base colours only' if unlit else ''}")
             print(text_table(heads, cells))
+    print(f"\n{unit_text(record)}")
     if record.skipped:
         print("\n== skipped")
         for why in dict.fromkeys(record.skipped.values()):

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,9 @@ from . import ladders, peers
 from .cases import Case, CaseKey, timed
 from .ladders import ACCUMULATION, Rung
 from .pictures import data_uri, error_map
-from .record import Record, Row, Times
+from .record import Record, Row
+from .times import LEAST_RUNS, Times
+from .unit import MISSING, Unit, Yardstick, opencv_blur
 
 __all__ = ["Job", "Settings", "WrongOutputError", "estimate_s", "list_jobs", "run", "verify"]
 
@@ -46,6 +48,8 @@ GAUSSIAN_METHODS = frozenset({"layered", "pyramid"})
 # Alpha of an opaque frame may be off by this much, and colour below zero by rounding.
 _ALPHA_TOLERANCE = 2e-3
 _NEGATIVE_TOLERANCE = 1e-3
+# Of the blur and the copies that run between the runs of a row, on two cores.
+_UNIT_S = 0.1
 # Above so many views accumulation is judged by its own kind of reference only: each other one is an image more.
 _OTHER_JUDGES_UP_TO = 256
 
@@ -158,7 +162,7 @@ def _jobs_of(method: str, case: CaseKey, settings: Settings, devices: Sequence[D
                     continue
                 # Two renderers, some frames each; the error; and perhaps a capture.
                 pixels = megapixels * rung.supersample**2
-                cost = 0.4 + settings.runs * (0.15 * pixels + 0.01) + 3.0 * megapixels
+                cost = 0.4 + settings.runs * (0.15 * pixels + 0.01 + _UNIT_S) + 3.0 * megapixels
                 key = f"{case}|{method}|{rung.name}|{device.index}"
                 yield Job(key, case, method, rung.name, cost, rung, device)
 
@@ -217,6 +221,8 @@ def run(settings: Settings, path: Path, progress: Progress, devices: Sequence[De
     devices = choose_devices(settings.devices) if devices is None else list(devices)
     jobs = list_jobs(settings, devices)
     record = _open_record(settings, path)
+    if opencv_blur()[0] is None:
+        progress(MISSING)
     labels = _labels(devices)
     todo = [job for job in jobs if job.key not in record.rows]
     left_s = estimate_s(todo, settings)
@@ -281,6 +287,7 @@ class _Bench:
         self.settings, self.record, self.peeler, self.cache = settings, record, peeler, cache
         self.labels, self.progress = labels, progress
         self._case: Case | None = None
+        self._yardstick = Yardstick()
 
     def do(self, job: Job) -> None:
         """Measure one row, or say why not."""
@@ -377,7 +384,8 @@ class _Bench:
                 kernels=measured.kernels,
                 wall=measured.wall,
                 build_ms=measured.build_ms,
-                kernels_in_copies=measured.kernels.median / measured.device["copy_16_mb"]["median_ms"],
+                kernels_in_copies=measured.unit.copies(measured.kernels),
+                unit=measured.unit,
                 peak_device_bytes=measured.peak_bytes,
                 input_bytes=frame.color.nbytes + frame.depth.nbytes,
             ),
@@ -389,8 +397,13 @@ class _Bench:
         seed = self.settings.seed
         case.accumulated(1, "gaussian", False, seed)  # uploads the scene
         runs = 1 if job.views > 64 else 2
-        made, times = timed(lambda: case.accumulated(job.views, "gaussian", False, seed), runs)
-        image = made.image
+        made: list[Image] = []
+
+        def draw() -> None:
+            made[:] = [case.accumulated(job.views, "gaussian", False, seed).image]
+
+        measured = self._yardstick.measure({"wall": draw}, runs, warm_up=0)
+        image, times = made[0], measured.times["wall"]
         frame, _ = case.frame(4)
         errors = {}
         for judge, aperture, jitter in (
@@ -415,6 +428,7 @@ class _Bench:
             errors=errors,
             views=job.views,
             wall=times,
+            unit=measured.unit,
         )
         return row, image
 
@@ -438,6 +452,7 @@ class _Bench:
             errors=errors,
             capture=capture,
             wall=times,
+            unit=self._yardstick.measure({}, LEAST_RUNS).unit,  # peers have processes of their own: right after them
             note=note,
         )
         return row, image
@@ -454,6 +469,7 @@ class Measured:
     build_ms: float
     peak_bytes: int
     device: dict[str, Any]
+    unit: Unit
 
 
 def measure(
@@ -476,18 +492,20 @@ def measure(
         image = first.image.copy()
         for _ in range(2):  # the ring's other slots
             renderer.render(_renewed(frame), lens, out)
-        _, wall = timed(lambda: renderer.render(_renewed(frame), lens, out), runs)
-        if not renderer.device.traits.is_cpu:
-            wall = replace(wall, cpu=None)
+        peak = renderer.peak_device_bytes
+        with Yardstick(renderer.device) as yardstick:
+            calls = {"wall": lambda: renderer.render(_renewed(frame), lens, out)}
+            measured = yardstick.measure(calls, runs)
+        wall = measured.times["wall"]
         if not np.array_equal(out, image):
             raise WrongOutputError(f"{method} gave another image for the same frame; its time means nothing.")
-        peak = renderer.peak_device_bytes
     with Renderer(method, device=device, profile=True, **options) as renderer:
         results = [renderer.render(_renewed(frame), lens, out) for _ in range(runs + 2)][2:]
         kernels = [sum(timing.ms for timing in result.timings) for result in results]
         transfer = _transfers(renderer.device, frame, size, runs)
         traits = _traits(renderer.device)
-    return Measured(image, wall, Times.of(kernels), transfer, max(0.0, first.wall_ms - wall.median), peak, traits)
+    build_ms = max(0.0, first.wall_ms - wall.median)
+    return Measured(image, wall, Times.of(kernels), transfer, build_ms, peak, traits, measured.unit)
 
 
 def verify(image: Image, size: tuple[int, int], opaque: bool) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..files import atomic_write
-from .analysis import case_table, columns, summary_table
+from .analysis import case_table, columns, summary_table, unit_text
 from .plots import accuracy_plot, has_matplotlib
 from .record import Record
 
@@ -161,6 +161,7 @@ def _notes(record: Record) -> str:
         if copies:
             text += f", copy of 16 MB {copies.get('median_ms', 0):.2f} ms"
         parts.append(f"<li>{html.escape(text)}</li>")
+    parts.append(f"<li>{html.escape(unit_text(record))}</li>")
     if record.run.get("capture_device"):
         parts.append(f"<li>{html.escape('Capture and accumulation: ' + str(record.run['capture_device']))}</li>")
     versions = ", ".join(f"{name} {version}" for name, version in (record.run.get("versions") or {}).items())

@@ -37,7 +37,7 @@ from ..frame import LayeredFrame
 from ..images import linear_from_srgb, srgb_from_linear
 from ..lens import Lens
 from .cases import CaseKey, build_scene, timed
-from .record import Times
+from .times import Times
 
 if TYPE_CHECKING:
     from .cases import Case

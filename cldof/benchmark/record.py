@@ -1,9 +1,9 @@
 """The JSON document of a run: plain numbers, written whole after every row, and all that a report needs.
 
 ==============  ==========================================================================================
-``schema``      1
+``schema``      2; 1 is read as well, and has no OpenCV blurs
 ``run``         commit, versions, seed, runs, whether quick, OpenGL renderer
-``devices``     traits of each OpenCL device by label, with the copy measured in this run
+``devices``     traits of each OpenCL device by label, with the copy measured when it was opened
 ``cases``       scene, size, lens, camera, largest blur, by key
 ``references``  views, noise floor and seconds, by ``case|aperture|jittered or not``
 ``rows``        one per case, method, setting and device, by key; see :class:`Row`
@@ -18,41 +18,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from statistics import median, quantiles
 from typing import Any
 
 from ..errors import InputError
 from ..files import atomic_write, read_json
+from .times import Times
+from .unit import Ratio, Unit
 
 __all__ = ["SCHEMA", "Record", "Row", "Times"]
 
-SCHEMA = 1
-
-
-@dataclass(frozen=True)
-class Times:
-    """Milliseconds of several runs: the least, the median, and the distance between the quartiles.
-
-    ``cpu`` is the median processor time, summed over cores, where the work is done on the CPU: on a machine that does
-    other things as well it says more than the clock.
-    """
-
-    min: float
-    median: float
-    iqr: float
-    runs: int
-    cpu: float | None = None
-
-    @classmethod
-    def of(cls, ms: Sequence[float], cpu_ms: Sequence[float] = ()) -> Times:
-        """Summarise measurements; at least one."""
-        if not ms:
-            raise InputError("Times.of needs at least one measurement.")
-        low, _, high = quantiles(ms, n=4, method="inclusive") if len(ms) > 1 else (0.0, 0.0, 0.0)
-        return cls(min(ms), median(ms), high - low, len(ms), median(cpu_ms) if cpu_ms else None)
+SCHEMA = 2
+# Records of schema 1 have no unit but copies of 16 MB.
+_READABLE = (1, SCHEMA)
 
 
 @dataclass(frozen=True)
@@ -80,6 +59,9 @@ class Row:
         What the first frame took longer than a steady one; the drivers' own caches are left as they are.
     kernels_in_copies : float, optional
         ``kernels`` in copies of 16 MB measured on the same device in the same run (medians).
+    unit : Unit, optional
+        What speeds are judged by: OpenCV's blur and the copy, timed between the runs of ``wall``. Older records have
+        none.
     peak_device_bytes, input_bytes : int, optional
         Memory that the renderer allocated; the frame's arrays, which a CPU device reads where they are.
     note : str
@@ -103,6 +85,7 @@ class Row:
     wall: Times | None = None
     build_ms: float | None = None
     kernels_in_copies: float | None = None
+    unit: Unit | None = None
     peak_device_bytes: int | None = None
     input_bytes: int | None = None
     note: str = ""
@@ -113,6 +96,11 @@ class Row:
         parts = [times.cpu for times in (self.capture, self.wall) if times is not None]
         known = [part for part in parts if part is not None]
         return sum(known) if known and len(known) == len(parts) else None
+
+    @property
+    def in_blurs(self) -> Ratio | None:
+        """``wall`` in blurs of :mod:`cldof.benchmark.unit`; None in older records and without OpenCV."""
+        return self.unit.ratio(self.wall) if self.unit and self.wall else None
 
     def error(self, metric: str, judge: str = "method") -> float | None:
         """One metric, or None where it was not measured."""
@@ -127,6 +115,8 @@ class Row:
         for name in ("capture", "transfer", "kernels", "wall"):
             if values.get(name) is not None:
                 values[name] = Times(**values[name])
+        if values.get("unit") is not None:
+            values["unit"] = Unit.from_dict(values["unit"])
         return cls(**values)
 
 
@@ -173,8 +163,9 @@ class Record:
         """
         try:
             data = read_json(path, str(path))
-            if data["schema"] != SCHEMA:
-                raise InputError(f"{path} has schema {data['schema']!r}; this cldof reads {SCHEMA}.")
+            if data["schema"] not in _READABLE:
+                readable = " and ".join(map(str, _READABLE))
+                raise InputError(f"{path} has schema {data['schema']!r}; this cldof reads {readable}.")
             rows = [Row.from_dict(row) for row in data["rows"]]
             parts = {name: dict(data[name]) for name in ("run", "devices", "cases", "references", "skipped", "images")}
             parts["references"] = _decoded(parts["references"])

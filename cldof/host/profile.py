@@ -1,9 +1,10 @@
-"""Time per pass from events, and the copy that all times are compared with."""
+"""Time per pass from events, and the copy that bandwidths are compared with."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import median
 
@@ -13,10 +14,20 @@ from .device import Device
 from .launch import launch
 from .scheduler import Submission
 
-__all__ = ["CopyBaseline", "PassTiming", "by_label", "copy_baseline", "copy_baseline_ms", "pass_timings", "table"]
+__all__ = [
+    "COPIES_PER_RUN",
+    "CopyBaseline",
+    "PassTiming",
+    "by_label",
+    "copy_baseline",
+    "copy_baseline_ms",
+    "copying",
+    "pass_timings",
+    "table",
+]
 
-# Copies per measurement: enough that a launch and a host synchronisation (8-40 us on a CPU) do not show.
-_COPIES_PER_RUN = 4
+COPIES_PER_RUN = 4
+"""Copies per measurement: enough that a launch and a host synchronisation (8-40 us on a CPU) do not show."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +64,7 @@ class PassTiming:
 
 @dataclass(frozen=True)
 class CopyBaseline:
-    """Time to copy a buffer to another on the device: the unit for speeds, as it comes from the same machine and hour.
+    """Time to copy a buffer to another on the device: what its memory gives to a pass that does nothing else.
 
     Attributes
     ----------
@@ -141,6 +152,34 @@ def table(timings: Sequence[PassTiming], baseline: CopyBaseline | None = None) -
     return "\n".join(lines)
 
 
+@contextmanager
+def copying(device: Device, nbytes: int = 16 * 1024 * 1024) -> Iterator[Callable[[], None]]:
+    """A function that copies one buffer to another on the device, four times over, and waits for it.
+
+    Parameters
+    ----------
+    device : Device
+    nbytes : int
+        Of one buffer. The default is one 1024x1024 RGBA float32 image.
+    """
+    pool = device.pool
+    source, target = pool.acquire(nbytes), pool.acquire(nbytes)
+
+    def copy() -> None:
+        done = filled
+        for _ in range(COPIES_PER_RUN):
+            done = launch(device.queue, "copy", cl.enqueue_copy, target, source, byte_count=nbytes, waits=[done]).event
+        done.wait()
+
+    try:
+        filled = launch(device.queue, "fill", cl.enqueue_fill_buffer, source, b"\0\0\0\0", 0, source.size).event
+        filled.wait()  # touches the memory; untouched pages would be read from one shared zero page
+        yield copy
+    finally:
+        pool.release(source)
+        pool.release(target)
+
+
 def copy_baseline(device: Device, nbytes: int = 16 * 1024 * 1024, runs: int = 20) -> CopyBaseline:
     """Measure a device-to-device copy by the wall clock, warmed up.
 
@@ -148,29 +187,19 @@ def copy_baseline(device: Device, nbytes: int = 16 * 1024 * 1024, runs: int = 20
     ----------
     device : Device
     nbytes : int
-        Of one buffer. The default is one 1024x1024 RGBA float32 image.
+        As for :func:`copying`.
     runs : int
         Measurements of four copies each.
     """
     if nbytes < 1 or runs < 1:
         raise InputError(f"a copy baseline needs bytes and runs, not nbytes={nbytes}, runs={runs}")
-    pool = device.pool
-    source, target = pool.acquire(nbytes), pool.acquire(nbytes)
-    try:
-        done = launch(device.queue, "fill", cl.enqueue_fill_buffer, source, b"\0\0\0\0", 0, source.size).event
-        done.wait()  # touches the memory; untouched pages would be read from one shared zero page
-        times = []
+    times = []
+    with copying(device, nbytes) as copy:
         for run in range(-2, runs):
             start = time.perf_counter()
-            for _ in range(_COPIES_PER_RUN):
-                copy = launch(device.queue, "copy", cl.enqueue_copy, target, source, byte_count=nbytes, waits=[done])
-                done = copy.event
-            done.wait()
+            copy()
             if run >= 0:  # the first two warm up
-                times.append((time.perf_counter() - start) * 1e3 / _COPIES_PER_RUN)
-    finally:
-        pool.release(source)
-        pool.release(target)
+                times.append((time.perf_counter() - start) * 1e3 / COPIES_PER_RUN)
     return CopyBaseline(nbytes, median(times), min(times), runs)
 
 

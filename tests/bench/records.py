@@ -6,11 +6,13 @@ import numpy as np
 
 from cldof.benchmark.pictures import data_uri
 from cldof.benchmark.record import Record, Row, Times
+from cldof.benchmark.unit import Unit
 
-__all__ = ["NASTY", "accumulation", "layered", "small_record"]
+__all__ = ["NASTY", "UNIT", "accumulation", "layered", "small_record"]
 
 NASTY = "a</script><script>alert(1)</script><img src=x onerror=alert(2)> 8x8"
 TIMES = Times(1.0, 2.0, 0.5, 3)
+UNIT = Unit(Times(98.0, 100.0, 2.0, 3, 200.0, 196.0, 4.0), Times(1.0, 1.5, 0.1, 3), threads=2, opencv="1.2")
 
 
 def accumulation(case: str, views: int, ms: float, psnr: float, aperture: str = "gaussian") -> Row:
@@ -24,7 +26,7 @@ def layered(case: str, psnr: float, setting: str = "default", ms: float = 10.0, 
     """A row of a method."""
     errors = {"method": {"psnr_db": psnr, "ssim": 0.9}, "picture": {"psnr_db": psnr - 1.0}, "disc": {"psnr_db": 30.0}}
     key = f"{case}|layered|{setting}|{device}"
-    times = {"capture": TIMES, "transfer": TIMES, "kernels": TIMES, "wall": TIMES}
+    times = {"capture": TIMES, "transfer": TIMES, "kernels": TIMES, "wall": TIMES, "unit": UNIT}
     return Row(key, case, "layered", setting, device, "gaussian", ms, errors, peels=4, build_ms=50.0, **times)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -14,9 +15,10 @@ from cldof.benchmark.analysis import (
     markdown_table,
     summary_table,
     text_table,
+    unit_text,
 )
-from cldof.benchmark.record import Record
-from tests.bench.records import accumulation, layered, small_record
+from cldof.benchmark.record import Record, Times
+from tests.bench.records import UNIT, accumulation, layered, small_record
 
 CASE = "row 8x8"
 
@@ -74,3 +76,31 @@ def test_columns_that_nobody_fills_are_left_out() -> None:
     assert "own" not in heads
     assert "capture" in heads
     assert {column.head for column in columns()} >= set(heads)
+
+
+def test_frames_are_judged_in_blurs_and_the_unit_is_described() -> None:
+    record = small_record()
+    heads, cells = case_table(record, CASE)
+    assert [line[heads.index("blurs")] for line in cells] == ["-", "-", "0.02", "0.02"]  # 2 ms of 100
+    heads, cells = summary_table(record)
+    assert [line[heads.index("blurs")] for line in cells] == ["-", "-", "0.02", "0.02"]
+    text = unit_text(record)
+    assert text.startswith("Unit: OpenCV 1.2, GaussianBlur of sigma 16, RGBA float32 1024x1024, 2 threads.")
+    assert "Medians of 2 rows: 100.0 to 100.0 ms by the clock, 200.0 to 200.0 ms of processor time" in text
+    assert "not idle in 0 of them" in text
+
+
+def test_a_busy_machine_is_judged_by_processor_time() -> None:
+    busy = replace(UNIT, blur=Times(150.0, 300.0, 90.0, 3, 200.0, 196.0, 4.0))
+    row = replace(layered(CASE, 35.0), unit=busy, wall=Times(20.0, 60.0, 9.0, 3, 50.0, 49.0, 1.0))
+    record = Record(rows={"one": row}, cases=small_record().cases)
+    heads, cells = case_table(record, CASE)
+    assert cells[0][heads.index("blurs")] == "0.25 (cpu)"
+    assert "not idle in 1 of them" in unit_text(record)
+
+
+def test_a_record_made_without_opencv_says_so() -> None:
+    rows = {"one": replace(layered(CASE, 35.0), unit=replace(UNIT, blur=None, threads=0, opencv=""))}
+    record = Record(rows=rows, cases=small_record().cases)
+    assert unit_text(record).startswith("OpenCV is not installed")
+    assert "blurs" not in case_table(record, CASE)[0]

@@ -74,6 +74,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, device_info
         assert row.wall
         assert row.transfer
         assert row.kernels_in_copies
+        assert row.unit and row.unit.copy
         assert row.peak_device_bytes
         assert row.device in record.devices
     assert any("|error of layered" in key for key in record.images)
