@@ -7,7 +7,7 @@ ARGS ?=
 
 export PYTHON
 
-.PHONY: help demo test test-devices test-cpus test-oclgrind stability mutants bench lint clean
+.PHONY: help demo test test-devices test-cpus gpu-check test-oclgrind stability mutants bench lint clean
 
 help:
 	@echo "make demo   render a built-in scene to out/demo.png (and out/demo-pinhole.png beside it)"
@@ -15,6 +15,7 @@ help:
 	@echo "make stability  hard cases on every device, measured into docs/stability.md"
 	@echo "make test-devices   the kernel and method tests on every OpenCL driver that can be installed, and how they agree"
 	@echo "make test-cpus      every kernel as other x86-64 processors and Debian's PoCL have it (under 15 minutes)"
+	@echo "make gpu-check      a GPU in eight minutes: pictures, speed, kernel tests, one JSON (DEVICE= picks)"
 	@echo "make test-oclgrind  every kernel under a simulator that checks each access to memory (minutes)"
 	@echo "make mutants        faults put into the kernels: how many the tests notice (an hour)"
 	@echo "make bench  speed of each pass, then accuracy and time of every method, quickly (4 minutes)"
@@ -47,6 +48,10 @@ test-cpus:
 	@scripts/setup.sh test
 	$(VENV)/python -m tests.tools.compiled
 	$(VENV)/python -m tests.tools.processors $(ARGS)
+
+gpu-check:
+	@scripts/setup.sh test
+	@scripts/gpu_check.sh $(if $(DEVICE),"$(DEVICE)") $(ARGS)
 
 test-oclgrind:
 	@scripts/setup.sh test

@@ -19,7 +19,7 @@ from cldof import Camera, LayeredFrame, Lens, Renderer, __version__
 from cldof.benchmark.harness import commit
 from cldof.benchmark.times import Times
 from cldof.benchmark.unit import MISSING, SIDE_PX, Yardstick, opencv_blur
-from cldof.errors import InputError
+from cldof.errors import CldofError, InputError
 from cldof.files import atomic_write
 from cldof.host.device import Device
 from cldof.host.passes import Buffer, FrameProgram, Local, Pass, Role, read, write
@@ -103,21 +103,41 @@ def report(
     ------
     InputError
         There is no such method.
+    CldofError
+        At the end, if something could not be rendered; what could has been printed and kept.
     """
     if unknown := [name for name in methods if name not in METHODS]:
         raise InputError(f"there is no method {unknown[0]!r}; there are {', '.join(sorted(METHODS))}")
-    record: dict[str, Any] = {"schema": 1, "cldof": __version__, "commit": commit(), "rows": [], "blurs": []}
+    record: dict[str, Any] = {
+        "schema": 1,
+        "cldof": __version__,
+        "commit": commit(),
+        "rows": [],
+        "not_timed": [],
+        "blurs": [],
+    }
     lens = Lens(0.021, 2.5)
     for width, height in sizes:
         frame = hard_frame(width, height)
         for method in methods:
             for title, options in VARIANTS.get(method, {method: {}}).items():
-                row = _frame(title, method, frame, lens, device, runs, seconds, options)
-                record["rows"].append({"title": title, **row})
+                try:
+                    row = _frame(title, method, frame, lens, device, runs, seconds, options)
+                except CldofError as error:  # of 4K on a small GPU, say; what else there is can be timed
+                    print(f"== {title}: {width}x{height} NOT TIMED: {error}\n", flush=True)
+                    record["not_timed"].append({"title": title, "width": width, "height": height, "why": str(error)})
+                else:
+                    record["rows"].append({"title": title, **row})
                 _save(record, output)
     if blurs:
         record["blurs"] = _blurs(device, runs)
         _save(record, output)
+    if failed := record["not_timed"]:
+        first = failed[0]
+        raise CldofError(
+            f"{len(failed)} of {len(failed) + len(record['rows'])} could not be timed, first {first['title']} at "
+            f"{first['width']}x{first['height']}: {first['why']}"
+        )
 
 
 def _save(record: dict[str, Any], path: str | None) -> None:
@@ -170,9 +190,8 @@ def _frame(
     print(unit.line("kernels, by events", kernels))
     print(f"{'judged':24s} {MISSING if judged is None else f'{judged} blurs a frame'}")
     print(table(passes, baseline))
-    print(
-        f"python per steady frame  min {min(python_ms):.2f} ms, median {median(python_ms):.2f} ms; grown {grown} bytes"
-    )
+    python = f"min {min(python_ms):.2f} ms, median {median(python_ms):.2f} ms"
+    print(f"python per steady frame  {python}; allocated {grown} bytes")
     print(f"device memory            {peak_bytes / 2**20:.0f} MiB\n", flush=True)
     return {
         "method": method,

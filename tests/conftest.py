@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +22,9 @@ from cldof.errors import DeviceError
 from cldof.host import opencl as cl
 from cldof.host.buffers import BufferPool
 from cldof.host.caches import prepare_environment, user_cache_dir
-from cldof.host.device import Device, DeviceInfo, Traits, list_devices
+from cldof.host.device import Device, DeviceInfo, list_devices
 from cldof.host.trial import SWITCH
+from tests.limits import limit_devices
 
 _REPOSITORY = Path(__file__).parents[1]
 
@@ -56,10 +55,14 @@ os.environ[SWITCH] = "0"
 
 
 def _find_devices() -> tuple[list[DeviceInfo], str]:
-    """All devices, or with ``CLDOF_TEST_DEVICE`` those whose name or platform has it."""
+    """All devices, or with ``CLDOF_TEST_DEVICE`` the one of that index, or those whose name or platform has it."""
     part = os.environ.get("CLDOF_TEST_DEVICE", "").lower()
     try:
-        found = [info for info in list_devices() if part in info.name.lower() or part in info.platform.lower()]
+        found = [
+            info
+            for info in list_devices()
+            if (info.index == int(part) if part.isdecimal() else part in f"{info.name}\n{info.platform}".lower())
+        ]
         return found, f"this machine has no OpenCL device {part}".rstrip()
     except DeviceError as error:
         return [], str(error)
@@ -69,29 +72,7 @@ _DEVICES, _WHY_NONE = _find_devices()
 _PARAMS = [pytest.param(info, id=f"{info.index}-{info.name.split('-')[0].replace(' ', '_')}") for info in _DEVICES]
 
 
-def _make_small() -> None:
-    """With ``CLDOF_TEST_LIMITS=64,32768[,gpu]`` every device has such work-groups and local memory, and is no CPU."""
-    if not (limits := os.environ.get("CLDOF_TEST_LIMITS")):
-        return
-    group, local_bytes, *kind = limits.split(",")
-    real: Any = Device.traits.func  # type: ignore[attr-defined]
-
-    def small(device: Device) -> Traits:
-        group_size = min(int(group), (traits := real(device)).max_work_group_size)
-        return replace(
-            traits,
-            max_work_group_size=group_size,
-            preferred_group_limit=min(group_size, traits.preferred_group_limit),
-            local_mem_bytes=min(int(local_bytes), traits.local_mem_bytes),
-            is_cpu=traits.is_cpu and not kind,
-        )
-
-    replaced = cached_property(small)
-    replaced.__set_name__(Device, "traits")
-    Device.traits = replaced  # type: ignore[method-assign, assignment]
-
-
-_make_small()
+limit_devices()
 
 
 class CanaryPool(BufferPool):

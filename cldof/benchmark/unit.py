@@ -178,7 +178,7 @@ class Yardstick:
         self._blur, self._threads, self._opencv = opencv_blur()
         self._copying = copying(device) if device else None
         self._copy = self._copying.__enter__() if self._copying else None
-        self._on_cpu = device is None or device.traits.is_cpu
+        self._on_cpu = device is None or device.info.kind == "cpu"
 
     def __enter__(self) -> Yardstick:
         return self

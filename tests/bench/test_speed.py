@@ -11,7 +11,7 @@ import pytest
 from bench import auto, planned, speed
 from cldof.benchmark.times import Times
 from cldof.benchmark.unit import Measured, Unit
-from cldof.errors import InputError
+from cldof.errors import CldofError, DeviceError, InputError
 from cldof.host.device import DeviceInfo
 from tests.bench.records import UNIT
 
@@ -39,12 +39,11 @@ def test_a_report_keeps_what_it_prints(
     pytest.importorskip("cv2")
     path = tmp_path / "speed.json"
     device = str(device_info.index)
-    speed.report(device, 3, [(40, 24), (24, 40)], ["gather"], blurs=False, output=str(path))
+    speed.report(device, 3, [(40, 24), (24, 40)], ["layered"], blurs=False, output=str(path))
     printed = capsys.readouterr().out
     record = json.loads(path.read_text())
     assert [(row["title"], row["width"], row["height"]) for row in record["rows"]] == [
-        ("gather", 40, 24),
-        ("gather", 24, 40),
+        (title, *size) for size in ((40, 24), (24, 40)) for title in speed.VARIANTS["layered"]
     ]
     for row in record["rows"]:
         unit, frame = Unit.from_dict(row["unit"]), Times(**row["frame"])
@@ -54,6 +53,24 @@ def test_a_report_keeps_what_it_prints(
         assert row["kernels"]["runs"] == frame.runs == 3
         assert 0.0 < row["kernels"]["min"] <= sum(row["passes_ms"].values()) * 1.001
         assert f"{judged} blurs a frame" in printed
+
+
+def test_what_cannot_be_rendered_costs_its_own_row_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def frame(title: str, method: str, *rest: object) -> dict[str, object]:
+        if method == "pyramid":
+            raise DeviceError("out of memory")
+        return {"method": method}
+
+    monkeypatch.setattr(speed, "_frame", frame)
+    path = tmp_path / "speed.json"
+    with pytest.raises(CldofError, match="1 of 2 could not be timed, first pyramid at 8x8: out of memory"):
+        speed.report(None, 3, [(8, 8)], ["pyramid", "gather"], blurs=False, output=str(path))
+    record = json.loads(path.read_text())
+    assert [row["title"] for row in record["rows"]] == ["gather"]
+    assert record["not_timed"] == [{"title": "pyramid", "width": 8, "height": 8, "why": "out of memory"}]
+    assert "pyramid: 8x8 NOT TIMED: out of memory" in capsys.readouterr().out
 
 
 def test_an_unknown_method_is_refused() -> None:
