@@ -221,7 +221,7 @@ def _blurs(choice: str | None, runs: int) -> list[dict[str, Any]]:
             with ExitStack() as stack:
                 calls = {
                     name: stack.enter_context(_blurring(device, image, program))
-                    for name, program in (("FIR", _fir_program(sigma)), ("IIR", _iir_program(sigma)))
+                    for name, program in (("FIR", _fir_program(sigma)), ("IIR", _iir_program(sigma, device.lanes)))
                 }
                 if opencv := opencv_blur(sigma)[0]:
                     calls["OpenCV"] = opencv
@@ -279,11 +279,11 @@ def _fir_program(sigma: float) -> FrameProgram:
     return FrameProgram.of([*_image_buffers(), Buffer("taps", data.nbytes, Role.CONSTANT, data)], [blur])
 
 
-def _iir_program(sigma: float) -> FrameProgram:
+def _iir_program(sigma: float, lanes: int) -> FrameProgram:
     sections = gaussian.iir_sections(sigma)
     sizes = tuple(np.int32(n) for n in (SIZE, SIZE, row_pitch(SIZE)))
     passes = [
-        Pass("blur", kernel, (write(target), read(source), read("sections"), *sizes), (SIZE // 4,), (1,))
+        Pass("blur", kernel, (write(target), read(source), read("sections"), *sizes), (SIZE // (lanes // 4),), (1,))
         for kernel, source, target in (("blur_iir_rows", "source", "rows"), ("blur_iir_columns", "rows", "out"))
     ]
     buffers = [

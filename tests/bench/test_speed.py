@@ -12,8 +12,10 @@ from bench import auto, planned, speed
 from cldof.benchmark.times import Times
 from cldof.benchmark.unit import Measured, Unit
 from cldof.errors import CldofError, DeviceError, InputError
-from cldof.host.device import DeviceInfo
+from cldof.host.device import Device, DeviceInfo
+from cldof.methods.base import row_pitch
 from tests.bench.records import UNIT
+from tests.running import padded, run_program
 
 
 def test_sizes_have_names_too() -> None:
@@ -53,6 +55,21 @@ def test_a_report_keeps_what_it_prints(
         assert row["kernels"]["runs"] == frame.runs == 3
         assert 0.0 < row["kernels"]["min"] <= sum(row["passes_ms"].values()) * 1.001
         assert f"{judged} blurs a frame" in printed
+
+
+@pytest.mark.parametrize("engine", ["fir", "iir"])
+def test_what_is_timed_as_a_blur_is_one(engine: str, device: Device) -> None:
+    """Away from the edges, which OpenCV continues in another way."""
+    cv2 = pytest.importorskip("cv2")
+    sigma = 3.0
+    size, margin = speed.SIZE, 40
+    image = np.random.default_rng(0).random((size, size, 4), np.float32)
+    program = speed._fir_program(sigma) if engine == "fir" else speed._iir_program(sigma, device.lanes)
+    pitch = row_pitch(size)
+    out = run_program(device, program, {"source": padded(image, pitch)}, {}, "out", (size, pitch, 4))
+    inner = slice(margin, -margin)
+    expected = cv2.GaussianBlur(image, (0, 0), sigma)[inner, inner]
+    assert np.abs(out[:, :size][inner, inner] - expected).max() < 5e-3
 
 
 def test_what_cannot_be_rendered_costs_its_own_row_alone(
