@@ -20,6 +20,9 @@
 
 #include "slots.clh"
 
+/* PoCL's compiler leaves calls of large functions, whose structs then go through memory: up to half of a kernel's time. */
+#define INLINE static inline __attribute__((always_inline))
+
 #define PYRAMID_LEVELS 16
 /* The most sub-images. */
 #define PYRAMID_COUNT 24
@@ -27,6 +30,10 @@
 #define PYRAMID_ROWS 8
 /* Pixels of a row whose depths are told together; sub-images begin at multiples of it. */
 #define PYRAMID_BLOCK 16
+/* Pixels that an item takes at a time, of one block: all of it where items are few, or LANES. */
+#ifndef PYRAMID_RUN
+#define PYRAMID_RUN PYRAMID_BLOCK
+#endif
 /* Below this coverage the result is 0 rather than a quotient of rounding errors. */
 #define PYRAMID_MIN_COVERAGE 1e-4f
 
@@ -86,33 +93,30 @@ typedef struct {
     float seam;
 } PyramidRamps;
 
-static inline PyramidRamps ramps_of(const __global PyramidMatting *matting, int i)
+INLINE PyramidRamps ramps_of(const __global PyramidMatting *matting, int i)
 {
     PyramidRamps ramps = {matting->ramp[i], matting->before[i], matting->seam[i]};
     return ramps;
 }
 
-/* A floath holds LANES / 2 values, one for each of 2 * PIXELS pixels. PIXEL_INDEX: 0, 1 ... */
+/* A floath holds LANES / 2 values, one for each of 2 * PIXELS pixels. */
 #if LANES == 16
 typedef float8 floath;
-#define PIXEL_INDEX ((int4)(0, 1, 2, 3))
 #elif LANES == 8
 typedef float4 floath;
-#define PIXEL_INDEX ((int2)(0, 1))
 #else
 typedef float2 floath;
-#define PIXEL_INDEX 0
 #endif
 
 typedef floath __attribute__((aligned(4))) floath_unaligned;
 typedef floatp __attribute__((aligned(4))) floatp_unaligned;
 
-static inline floath load_half(const __global float *p) { return *(const __global floath_unaligned *)p; }
-static inline floatp load_part(const __global float *p) { return *(const __global floatp_unaligned *)p; }
-static inline void store_part(__global float *p, floatp v) { *(__global floatp_unaligned *)p = v; }
+INLINE floath load_half(const __global float *p) { return *(const __global floath_unaligned *)p; }
+INLINE floatp load_part(const __global float *p) { return *(const __global floatp_unaligned *)p; }
+INLINE void store_part(__global float *p, floatp v) { *(__global floatp_unaligned *)p = v; }
 
 /* The least of PIXELS values. */
-static inline float least_part(floatp v)
+INLINE float least_part(floatp v)
 {
 #if LANES == 16
     const float2 two = v.lo < v.hi ? v.lo : v.hi;
@@ -124,10 +128,10 @@ static inline float least_part(floatp v)
 #endif
 }
 
-static inline float greatest_part(floatp v) { return -least_part(-v); }
+INLINE float greatest_part(floatp v) { return -least_part(-v); }
 
 /* Of 2 * PIXELS pixels those with even places, or with odd ones; and one of the former beside one of the latter. */
-static inline floatn even_pixels(floatn a, floatn b)
+INLINE floatn even_pixels(floatn a, floatn b)
 {
 #if LANES == 16
     return (floatn)(a.s0123, a.s89ab, b.s0123, b.s89ab);
@@ -138,7 +142,7 @@ static inline floatn even_pixels(floatn a, floatn b)
 #endif
 }
 
-static inline floatn odd_pixels(floatn a, floatn b)
+INLINE floatn odd_pixels(floatn a, floatn b)
 {
 #if LANES == 16
     return (floatn)(a.s4567, a.scdef, b.s4567, b.scdef);
@@ -149,7 +153,7 @@ static inline floatn odd_pixels(floatn a, floatn b)
 #endif
 }
 
-static inline void interleave_pixels(floatn to[2], floatn even, floatn odd)
+INLINE void interleave_pixels(floatn to[2], floatn even, floatn odd)
 {
 #if LANES == 16
     to[0] = (floatn)(even.s0123, odd.s0123, even.s4567, odd.s4567);
@@ -168,7 +172,7 @@ static inline void interleave_pixels(floatn to[2], floatn even, floatn odd)
  *         inv_depth  float[peels][height][pitch]  1/m
  * writes  flat       float[sources][height][pitch][4]  0 in holes and past the row
  *         flat_inv   float[sources][height][pitch]     1/m, of the peel with which half of the pixel is covered
- * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th PIXELS
+ * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th LANES
  *         pixels */
 __kernel void pyramid_flatten(__global float *restrict flat, __global float *restrict flat_inv,
                               const __global float *restrict color, const __global float *restrict inv_depth,
@@ -176,45 +180,54 @@ __kernel void pyramid_flatten(__global float *restrict flat, __global float *res
 {
     const int row = get_global_id(1);
     const int source = row / size.height, y = row % size.height;
-    for (int x = PIXELS * get_global_id(0); x < size.pitch; x += PIXELS * get_global_size(0)) {
-        const int n = size.width - x;
-        floatn image = (floatn)(0.0f);
-        floatp depth = (floatp)(EMPTY), nearest = (floatp)(EMPTY);
-        for (int m = source; m < size.peels && n > 0; m++) {
+    for (int x = LANES * get_global_id(0); x < size.pitch; x += LANES * get_global_size(0)) {
+        floatn image[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
+        floatn depth = (floatn)(EMPTY), nearest = (floatn)(EMPTY), alpha = (floatn)(0.0f);
+        for (int m = source; m < size.peels; m++) {
             const size_t at = (size_t)m * size.height + y;
-            const __global float *rgba = color + (at * size.width + x) * 4;
-            floatp w = load_part(inv_depth + at * size.pitch + x);
-            if (greatest_part(w) < 0.0f) continue;
-            floatn c = load_pixels(rgba, n);
-            intp there = (w >= 0.0f) & (c.ALPHA > 0.0f);
-            image = over(image, c);
-            floatp alpha = image.ALPHA;
-            nearest = ((nearest < 0.0f) & there) ? w : nearest;
-            depth = ((depth < 0.0f) & there & (alpha >= 0.5f)) ? w : depth;
-            if (least_part(alpha) >= 1.0f) break;
+            const floatn w = load_lanes(inv_depth + at * size.pitch + x);
+            if (!any_lane(w >= 0.0f)) continue;
+            floatn c[4];
+#pragma unroll
+            for (int q = 0; q < 4; q++) {
+                const int n = size.width - x - PIXELS * q;
+                c[q] = (floatn)(0.0f);
+                if (n > 0) c[q] = load_pixels(color + (at * size.width + x + PIXELS * q) * 4, n);
+                image[q] = over(image[q], c[q]);
+            }
+            const intn there = w >= 0.0f && CHANNEL_OF(c, ALPHA) > 0.0f;
+            alpha = CHANNEL_OF(image, ALPHA);
+            nearest = nearest < 0.0f && there ? w : nearest;
+            depth = depth < 0.0f && there && alpha >= 0.5f ? w : depth;
+            if (least_lane(alpha) >= 1.0f) break;
         }
-        const intp inside = PIXEL_INDEX < n;
-        floatp alpha = image.ALPHA;
+        const intn inside = LANE_INDEX < size.width - x;
 #if PYRAMID_VOID
-        floatp known = (floatp)(1.0f);
         depth = depth < 0.0f ? nearest : depth;
-        depth = depth < 0.0f ? (floatp)(0.0f) : depth;
-        depth = inside ? depth : (floatp)(EMPTY);
+        depth = depth < 0.0f ? (floatn)(0.0f) : depth;
+        depth = inside ? depth : (floatn)(EMPTY);
+        const floatn known = inside ? (floatn)(1.0f) : (floatn)(0.0f), scale = known;
 #else
-        intp is_known = (alpha >= 0.5f) & inside;
-        floatp known = is_known ? (floatp)(1.0f) : (floatp)(0.0f);
-        image *= spread(is_known ? 1.0f / alpha : (floatp)(0.0f));
-        depth = is_known ? depth : (floatp)(EMPTY);
-#endif
-#if PYRAMID_ALPHA == 0
-        image.ALPHA = known;
-#elif PYRAMID_ALPHA == 1
-        image = image.ALPHAS * every_pixel((float4)(1.0f, 0.0f, 0.0f, 0.0f));
-        image.ALPHA = known;
+        const intn is_known = alpha >= 0.5f && inside;
+        const floatn known = is_known ? (floatn)(1.0f) : (floatn)(0.0f);
+        depth = is_known ? depth : (floatn)(EMPTY);
+        floatn scale = (floatn)(0.0f);
+        if (any_lane(is_known)) scale = is_known ? 1.0f / alpha : scale;
 #endif
         const size_t to = (size_t)row * size.pitch + x;
-        store_lanes(flat + to * 4, image * spread(inside ? (floatp)(1.0f) : (floatp)(0.0f)));
-        store_part(flat_inv + to, depth);
+        store_lanes(flat_inv + to, depth);
+        const floatp scales[4] = FOUR_PARTS(scale), coverage[4] = FOUR_PARTS(known);
+#pragma unroll
+        for (int q = 0; q < 4; q++) {
+            floatn c = image[q] * spread(scales[q]);
+#if PYRAMID_ALPHA == 0
+            c.ALPHA = coverage[q];
+#elif PYRAMID_ALPHA == 1
+            c = c.ALPHAS * every_pixel((float4)(1.0f, 0.0f, 0.0f, 0.0f));
+            c.ALPHA = coverage[q];
+#endif
+            store_lanes(flat + (to + PIXELS * q) * 4, c);
+        }
     }
 }
 
@@ -269,7 +282,7 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
 
 /* --- matting (section 3.3) --- */
 
-static inline floatn matting_axis(floatn w)
+INLINE floatn matting_axis(floatn w)
 {
 #if PYRAMID_PAPER
     return 1.0f / (w > 1e-20f ? w : (floatn)(1e-20f));
@@ -286,7 +299,7 @@ static inline floatn matting_axis(floatn w)
  * far as the blur opens a seam, and is broad, or it would vanish at the
  * start of its own interval; what crosses the whole ramp between two pixels is a silhouette. Slope and
  * breadth are read where they count; 0 stands for no slope, and for broad. */
-static inline floatn matting_rise(floatn w, const __global float *slope, const __global float *broad,
+INLINE floatn matting_rise(floatn w, const __global float *slope, const __global float *broad,
                                   PyramidRamps ramps)
 {
     floatn rising = matting_axis(w) * ramps.ramp.x + ramps.ramp.y;
@@ -313,72 +326,76 @@ static inline floatn matting_rise(floatn w, const __global float *slope, const _
     return w < 0.0f ? (floatn)(0.0f) : clamp01(rising);
 }
 
-static inline floatn matting_fall(floatn w, float4 ramp) { return clamp01(matting_axis(w) * ramp.z + ramp.w); }
+INLINE floatn matting_fall(floatn w, float4 ramp) { return clamp01(matting_axis(w) * ramp.z + ramp.w); }
 
 /* --- culling (section 3.1) --- */
 
 /* Nearest and farthest slot of a block tell of most that a sub-image culls all of it, or none, or has no use for it. */
-static inline const __global float *span_of(const __global float *span, PyramidSize size, int s, int x, int y)
+INLINE const __global float *span_of(const __global float *span, PyramidSize size, int s, int x, int y)
 {
     return span + (((size_t)s * size.height + y) * size.pitch + x) / PYRAMID_BLOCK * 2;
 }
 
-/* The first source of which a sub-image does not cull all slots of the block of a pixel; size.sources if there is none,
- * or no such pixel. */
-static inline int first_left(const __global float *span, PyramidSize size, PyramidRamps ramps, int x, int y)
+/* What is known of a block in a sub-image. */
+typedef struct {
+    int first; /* the first source of which the sub-image does not cull all slots; size.sources if there is none */
+    int kind;
+} PyramidBlock;
+
+#define BLOCK_MIXED 0
+/* All of `first` is past the front ramp: no pixel is culled, or shows anything behind it. */
+#define BLOCK_PAST 1
+/* The same, and all of it is too far behind the sub-image to be in it. */
+#define BLOCK_BEHIND 2
+
+/* The block of frame pixel (x, y), which may lie outside. */
+INLINE PyramidBlock block_of(const __global float *span, PyramidSize size, PyramidRamps ramps, int x, int y)
 {
-    if (x < 0 || x >= size.pitch || y < 0 || y >= size.height) return size.sources;
+    PyramidBlock block = {size.sources, BLOCK_MIXED};
+    if (x < 0 || x >= size.pitch || y < 0 || y >= size.height) return block;
 #if PYRAMID_PAPER
-    return 0;
+    block.first = 0;
 #else
-    int s = 0;
-    for (; s < size.sources; s++) {
-        const __global float *of = span_of(span, size, s, x, y);
-        const float farthest = of[1] < 0.0f ? EMPTY - of[1] : of[1];
-        if (of[0] >= 0.0f && farthest * ramps.ramp.x + ramps.ramp.y > 0.0f) break;
+    const __global float *of = span_of(span, size, 0, x, y);
+    for (int s = 0; s < size.sources; s++, of += (size_t)size.height * size.pitch / PYRAMID_BLOCK * 2) {
+        const float nearest = of[0], farthest = of[1] < 0.0f ? EMPTY - of[1] : of[1];
+        if (nearest < 0.0f || farthest * ramps.ramp.x + ramps.ramp.y <= 0.0f) continue;
+        block.first = s;
+        if (of[1] < 0.0f) break; /* holes */
+        if (nearest * ramps.ramp.z + ramps.ramp.w <= 0.0f) block.kind = BLOCK_BEHIND;
+        else if (nearest * ramps.ramp.x + ramps.ramp.y >= 1.0f &&
+                 (s > 0 || nearest * ramps.before.x + ramps.before.y <= 0.0f)) block.kind = BLOCK_PAST;
+        break;
     }
-    return s;
 #endif
-}
-
-/* Whether a block has no holes and is too far behind a sub-image to be in it. */
-static inline int is_behind(const __global float *of, PyramidRamps ramps)
-{
-    return of[1] >= 0.0f && of[0] * ramps.ramp.z + ramps.ramp.w <= 0.0f;
-}
-
-/* Whether a block has no holes and is past a sub-image's front ramp. */
-static inline int is_past(const __global float *of, PyramidRamps ramps)
-{
-    return of[1] >= 0.0f && of[0] * ramps.ramp.x + ramps.ramp.y >= 1.0f;
+    return block;
 }
 
 /* The first source of LANES frame pixels, from source `first` on, that a sub-image does not cull.
  * Returns its front ramp, 0 where all sources are culled; there `from` is -1 and `inverse` EMPTY. `only` is the source
  * of all pixels, -1 if all are culled, MIXED if they differ. */
 #define MIXED (-2)
-static inline floatn cull(floatn *from, int *only, floatn *inverse, const __global float *flat_inv,
-                          const __global float *slope, const __global float *broad, const __global float *span,
-                          PyramidSize size, PyramidRamps ramps, int x, int y, int first)
+INLINE floatn cull(floatn *from, int *only, floatn *inverse, const __global float *flat_inv,
+                   const __global float *slope, const __global float *broad, PyramidSize size, PyramidRamps ramps,
+                   int x, int y, PyramidBlock block)
 {
     floatn rise = (floatn)(0.0f), w = (floatn)(EMPTY), source = (floatn)(-1.0f);
     *only = -1;
-    for (int s = first; s < size.sources; s++) {
+    for (int s = block.first; s < size.sources; s++) {
         const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
-        floatn ws = load_lanes(flat_inv + at);
+        const floatn ws = load_lanes(flat_inv + at);
 #if PYRAMID_PAPER
-        floatn r = matting_rise(ws, 0, 0, ramps);
+        const floatn r = matting_rise(ws, 0, 0, ramps);
 #else
-        const __global float *of = span_of(span, size, s, x, y);
-        if (s == first && is_past(of, ramps) && (s > 0 || of[0] * ramps.before.x + ramps.before.y <= 0.0f)) {
+        if (block.kind != BLOCK_MIXED) {
             *only = s;
             *from = (floatn)((float)s);
             *inverse = ws;
             return (floatn)(1.0f);
         }
-        floatn r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
+        const floatn r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
 #endif
-        intn take = (rise <= 0.0f) & (r > 0.0f);
+        const intn take = rise <= 0.0f && r > 0.0f;
         w = take ? ws : w;
         source = take ? (floatn)((float)s) : source;
         rise = take ? r : rise;
@@ -392,7 +409,7 @@ static inline floatn cull(floatn *from, int *only, floatn *inverse, const __glob
 }
 
 /* Colours of PIXELS pixels from the sources that `cull` chose; 0 in holes. */
-static inline floatn source_pixels(const __global float *flat, PyramidSize size, floatp from, int only, int x, int y)
+INLINE floatn source_pixels(const __global float *flat, PyramidSize size, floatp from, int only, int x, int y)
 {
     floatn c = (floatn)(0.0f);
     if (only == -1) return c;
@@ -409,8 +426,8 @@ static inline floatn source_pixels(const __global float *flat, PyramidSize size,
 
 /* PIXELS coarser pixels from two rows of twice as many finer ones: the mean of those of 2x2 that are no holes. Holes
  * hold colour 0 and a negative inverse depth. */
-static inline void pull_pixels(__global float *color, __global float *inv, floatn top0, floatn top1, floath w_top,
-                               floatn low0, floatn low1, floath w_low)
+INLINE void pull_pixels(__global float *color, __global float *inv, floatn top0, floatn top1, floath w_top,
+                        floatn low0, floatn low1, floath w_low)
 {
     floath known_top = w_top < 0.0f ? (floath)(0.0f) : (floath)(1.0f);
     floath known_low = w_low < 0.0f ? (floath)(0.0f) : (floath)(1.0f);
@@ -421,6 +438,20 @@ static inline void pull_pixels(__global float *color, __global float *inv, float
     floatp scale = count > 0.0f ? 1.0f / count : (floatp)(0.0f);
     store_lanes(color, sum * spread(scale));
     store_part(inv, count > 0.0f ? depth * scale : (floatp)(EMPTY));
+}
+
+/* The same for 2 * PIXELS coarser pixels where there are no holes. */
+INLINE void pull_whole(__global float *color, __global float *inv, const __global float *flat,
+                       const __global float *flat_inv, size_t top, size_t low)
+{
+#pragma unroll
+    for (int h = 0; h < 2; h++) {
+        const __global float *upper = flat + (top + 2 * PIXELS * h) * 4, *lower = flat + (low + 2 * PIXELS * h) * 4;
+        const floatn a = load_lanes(upper) + load_lanes(lower), b = load_lanes(upper + LANES) + load_lanes(lower + LANES);
+        store_lanes(color + LANES * h, 0.25f * (even_pixels(a, b) + odd_pixels(a, b)));
+    }
+    const floatn w = load_lanes(flat_inv + top) + load_lanes(flat_inv + low);
+    *(__global floath_unaligned *)inv = 0.25f * (w.even + w.odd);
 }
 
 /* pyramid_cull: culls a sub-image's foreground and pulls level 1 from what is left.
@@ -442,33 +473,42 @@ __kernel void pyramid_cull(__global float *restrict fill, __global float *restri
     if (row < 0 || row >= level.z) return;
     const PyramidRamps ramps = ramps_of(matting, i);
     const int y = 2 * row - sub.x;
-    for (int b = get_global_id(0); b < level.w / (2 * PIXELS); b += get_global_size(0)) {
-        const int x = LANES * b - sub.x;
-        const size_t to = (size_t)level.x + (size_t)row * level.w + 2 * PIXELS * b;
-        floatn from[2], w[2];
-        int only[2];
-#pragma unroll
-        for (int r = 0; r < 2; r++)
-            cull(&from[r], &only[r], &w[r], flat_inv, slope, broad, span, size, ramps, x, y + r,
-                 first_left(span, size, ramps, x, y + r));
-        if (only[0] == -1 && only[1] == -1) {
-            store_lanes(fill + to * 4, (floatn)(0.0f));
-            store_lanes(fill + to * 4 + LANES, (floatn)(0.0f));
-            store_part(fill_inv + to, (floatp)(EMPTY));
-            store_part(fill_inv + to + PIXELS, (floatp)(EMPTY));
-            continue;
-        }
-#pragma unroll
-        for (int h = 0; h < 2; h++) { /* halves of the run */
-            floatn c[2][2];
-#pragma unroll
-            for (int r = 0; r < 2; r++) {
-                const floatp f[4] = FOUR_PARTS(from[r]);
-                c[r][0] = source_pixels(flat, size, f[2 * h], only[r], x + 2 * PIXELS * h, y + r);
-                c[r][1] = source_pixels(flat, size, f[2 * h + 1], only[r], x + 2 * PIXELS * h + PIXELS, y + r);
+    for (int first = PYRAMID_RUN * get_global_id(0); first < 2 * level.w; first += PYRAMID_RUN * get_global_size(0)) {
+        const int x0 = first - sub.x;
+        const size_t to0 = (size_t)level.x + (size_t)row * level.w + first / 2;
+        const PyramidBlock upper = block_of(span, size, ramps, x0, y), lower = block_of(span, size, ramps, x0, y + 1);
+        const int is_empty = upper.first == size.sources && lower.first == size.sources;
+        const int is_whole = upper.kind != BLOCK_MIXED && lower.kind != BLOCK_MIXED;
+        for (int x = x0; x < x0 + PYRAMID_RUN; x += LANES) {
+            const size_t to = to0 + (x - x0) / 2;
+            if (is_empty) {
+                store_lanes(fill + to * 4, (floatn)(0.0f));
+                store_lanes(fill + to * 4 + LANES, (floatn)(0.0f));
+                *(__global floath_unaligned *)(fill_inv + to) = (floath)(EMPTY);
+                continue;
             }
-            pull_pixels(fill + (to + PIXELS * h) * 4, fill_inv + to + PIXELS * h, c[0][0], c[0][1],
-                        h ? w[0].hi : w[0].lo, c[1][0], c[1][1], h ? w[1].hi : w[1].lo);
+            if (is_whole) {
+                pull_whole(fill + to * 4, fill_inv + to, flat, flat_inv,
+                           ((size_t)upper.first * size.height + y) * size.pitch + x,
+                           ((size_t)lower.first * size.height + y + 1) * size.pitch + x);
+                continue;
+            }
+            floatn from[2], w[2];
+            int only[2];
+            cull(&from[0], &only[0], &w[0], flat_inv, slope, broad, size, ramps, x, y, upper);
+            cull(&from[1], &only[1], &w[1], flat_inv, slope, broad, size, ramps, x, y + 1, lower);
+#pragma unroll
+            for (int h = 0; h < 2; h++) { /* halves of the run */
+                floatn c[2][2];
+#pragma unroll
+                for (int r = 0; r < 2; r++) {
+                    const floatp f[4] = FOUR_PARTS(from[r]);
+                    c[r][0] = source_pixels(flat, size, f[2 * h], only[r], x + 2 * PIXELS * h, y + r);
+                    c[r][1] = source_pixels(flat, size, f[2 * h + 1], only[r], x + 2 * PIXELS * h + PIXELS, y + r);
+                }
+                pull_pixels(fill + (to + PIXELS * h) * 4, fill_inv + to + PIXELS * h, c[0][0], c[0][1],
+                            h ? w[0].hi : w[0].lo, c[1][0], c[1][1], h ? w[1].hi : w[1].lo);
+            }
         }
     }
 }
@@ -508,7 +548,7 @@ typedef struct {
     int width;
 } Between;
 
-static inline Between between(int4 level, int fine_row)
+INLINE Between between(int4 level, int fine_row)
 {
     const int near = clamp_index(fine_row >> 1, level.z - 1);
     const int far = clamp_index(fine_row & 1 ? near + 1 : near - 1, level.z - 1);
@@ -517,7 +557,7 @@ static inline Between between(int4 level, int fine_row)
 }
 
 /* PIXELS pixels at x of a row; beyond its ends the row repeats its edge. */
-static inline floatn load_pixels_edge(const __global float *row, int x, int width)
+INLINE floatn load_pixels_edge(const __global float *row, int x, int width)
 {
     if (x >= 0 && x + PIXELS <= width) return load_lanes(row + x * 4);
 #define EDGE_PIXEL(i) load_pixel(row + clamp_index(x + i, width - 1) * 4)
@@ -525,7 +565,7 @@ static inline floatn load_pixels_edge(const __global float *row, int x, int widt
 #undef EDGE_PIXEL
 }
 
-static inline floath load_half_edge(const __global float *row, int x, int width)
+INLINE floath load_half_edge(const __global float *row, int x, int width)
 {
     if (x >= 0 && x + 2 * PIXELS <= width) return load_half(row + x);
     float v[2 * PIXELS];
@@ -534,23 +574,38 @@ static inline floath load_half_edge(const __global float *row, int x, int width)
     return *(const floath_unaligned *)v;
 }
 
+/* PIXELS values between rows, or twice as many of inverse depth. */
+INLINE floatn mixed_rows(floatn near, floatn far) { return 0.75f * near + 0.25f * far; }
+INLINE floath mixed_depths(floath near, floath far) { return 0.75f * near + 0.25f * far; }
+
 /* Quadratic B-spline subdivision: the finer pixels over PIXELS coarser ones at x (weights 9, 3, 3, 1 of 16). */
-static inline void expand_pixels(floatn fine[2], const __global float *image, Between rows, int x)
+INLINE void expand_pixels(floatn fine[2], const __global float *image, Between rows, int x)
 {
     const __global float *near = image + rows.near * 4, *far = image + rows.far * 4;
-    floatn left = 0.75f * load_pixels_edge(near, x - 1, rows.width) + 0.25f * load_pixels_edge(far, x - 1, rows.width);
-    floatn mid = 0.75f * load_pixels_edge(near, x, rows.width) + 0.25f * load_pixels_edge(far, x, rows.width);
-    floatn right = 0.75f * load_pixels_edge(near, x + 1, rows.width) + 0.25f * load_pixels_edge(far, x + 1, rows.width);
+    floatn left, mid, right;
+    if (x > 0 && x + PIXELS < rows.width) {
+        near += x * 4;
+        far += x * 4;
+        left = mixed_rows(load_lanes(near - 4), load_lanes(far - 4));
+        mid = mixed_rows(load_lanes(near), load_lanes(far));
+        right = mixed_rows(load_lanes(near + 4), load_lanes(far + 4));
+    } else {
+        left = mixed_rows(load_pixels_edge(near, x - 1, rows.width), load_pixels_edge(far, x - 1, rows.width));
+        mid = mixed_rows(load_pixels_edge(near, x, rows.width), load_pixels_edge(far, x, rows.width));
+        right = mixed_rows(load_pixels_edge(near, x + 1, rows.width), load_pixels_edge(far, x + 1, rows.width));
+    }
     interleave_pixels(fine, 0.75f * mid + 0.25f * left, 0.75f * mid + 0.25f * right);
 }
 
 /* The same for inverse depth: LANES finer pixels. */
-static inline floatn expand_depth(const __global float *inv, Between rows, int x)
+INLINE floatn expand_depth(const __global float *inv, Between rows, int x)
 {
     const __global float *near = inv + rows.near, *far = inv + rows.far;
-    floath left = 0.75f * load_half_edge(near, x - 1, rows.width) + 0.25f * load_half_edge(far, x - 1, rows.width);
-    floath mid = 0.75f * load_half_edge(near, x, rows.width) + 0.25f * load_half_edge(far, x, rows.width);
-    floath right = 0.75f * load_half_edge(near, x + 1, rows.width) + 0.25f * load_half_edge(far, x + 1, rows.width);
+    const floath left =
+        mixed_depths(load_half_edge(near, x - 1, rows.width), load_half_edge(far, x - 1, rows.width));
+    const floath mid = mixed_depths(load_half_edge(near, x, rows.width), load_half_edge(far, x, rows.width));
+    const floath right =
+        mixed_depths(load_half_edge(near, x + 1, rows.width), load_half_edge(far, x + 1, rows.width));
     floatn fine;
     fine.even = 0.75f * mid + 0.25f * left;
     fine.odd = 0.75f * mid + 0.25f * right;
@@ -589,18 +644,23 @@ __kernel void pyramid_push(__global float *restrict fill, __global float *restri
 
 /* Adds LANES pixels of a sub-image's level 0, culled, disoccluded and weighted, to `quad`. Returns 0 if nothing is
  * there. */
-static inline int add_matted(floatn quad[4], const __global float *flat, const __global float *flat_inv,
-                             const __global float *slope, const __global float *broad, const __global float *span,
-                             const __global float *fill, const __global float *fill_inv, int4 sub, int4 level,
-                             PyramidSize size, PyramidRamps ramps, int x, int y)
+INLINE int add_matted(floatn quad[4], const __global float *flat, const __global float *flat_inv,
+                      const __global float *slope, const __global float *broad, const __global float *fill,
+                      const __global float *fill_inv, int4 sub, int4 level, PyramidSize size, PyramidRamps ramps, int x,
+                      int y, PyramidBlock block)
 {
-    const int first = first_left(span, size, ramps, x, y);
-#if !PYRAMID_PAPER
-    if (first < size.sources && is_behind(span_of(span, size, first, x, y), ramps)) return 0;
-#endif
+    if (block.kind == BLOCK_BEHIND) return 0;
+    if (block.kind == BLOCK_PAST) {
+        const size_t at = ((size_t)block.first * size.height + y) * size.pitch + x;
+        const floatn weight = matting_fall(load_lanes(flat_inv + at), ramps.ramp);
+        const floatp weights[4] = FOUR_PARTS(weight);
+#pragma unroll
+        for (int q = 0; q < 4; q++) quad[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread(weights[q]);
+        return 1;
+    }
     floatn from, w;
     int only;
-    floatn weight = cull(&from, &only, &w, flat_inv, slope, broad, span, size, ramps, x, y, first);
+    floatn weight = cull(&from, &only, &w, flat_inv, slope, broad, size, ramps, x, y, block);
     /* What a visible surface with a share of its weight lets through of the next that is not culled. */
     floatn lets = from == 0.0f ? 1.0f - weight : (floatn)(0.0f);
     weight *= matting_fall(w, ramps.ramp);
@@ -653,7 +713,7 @@ static inline int add_matted(floatn quad[4], const __global float *flat, const _
 #define BOX_RUNS (LANES == 4 ? 4 : 3)
 
 /* PIXELS coarser pixels: sums of four finer ones, two apart. */
-static inline floatn box_pixels(const floatn v[BOX_RUNS])
+INLINE floatn box_pixels(const floatn v[BOX_RUNS])
 {
     const floatn pairs = even_pixels(v[0], v[1]) + odd_pixels(v[0], v[1]);
 #if LANES == 16
@@ -665,7 +725,7 @@ static inline floatn box_pixels(const floatn v[BOX_RUNS])
 #endif
 }
 
-static inline float4 load_pixel_local(const __local float *p) { return *(const __local float4_unaligned *)p; }
+INLINE float4 load_pixel_local(const __local float *p) { return *(const __local float4_unaligned *)p; }
 
 /* pyramid_matte: level 0 of a sub-image, matted, and reduced to level 1 in the same breath.
  * source  sections 3.3 and 3.4
@@ -698,15 +758,21 @@ __kernel void pyramid_matte(__global float *restrict blur, const __global float 
         __local float *line = lines + (p & 1) * line_width * 4;
         const __local float *other = lines + (~p & 1) * line_width * 4;
         if (row >= 0 && row <= height && x0 < level.y) {
-            for (int b = lid; b < line_width / LANES; b += items) {
-                const int x = first + LANES * b;
-                if (x < 0 || x >= sub.z) continue;
-                floatn sum[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
-                for (int r = 2 * row - 1; r <= 2 * row; r++)
-                    add_matted(sum, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size, ramps,
-                               x - sub.x, clamp_index(r, sub.w - 1) - sub.x);
+            const int upper_y = clamp_index(2 * row - 1, sub.w - 1) - sub.x;
+            const int lower_y = clamp_index(2 * row, sub.w - 1) - sub.x;
+            for (int at = PYRAMID_RUN * lid; at < line_width; at += PYRAMID_RUN * items) {
+                if (first + at < 0 || first + at >= sub.z) continue;
+                const int x = first + at - sub.x;
+                const PyramidBlock upper = block_of(span, size, ramps, x, upper_y);
+                const PyramidBlock lower = block_of(span, size, ramps, x, lower_y);
+                for (int j = 0; j < PYRAMID_RUN; j += LANES) {
+                    floatn sum[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
+                    for (int r = 0; r < 2; r++)
+                        add_matted(sum, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x + j,
+                                   r ? lower_y : upper_y, r ? lower : upper);
 #pragma unroll
-                for (int q = 0; q < 4; q++) store_lanes_local(line + (LANES * b + PIXELS * q) * 4, sum[q]);
+                    for (int q = 0; q < 4; q++) store_lanes_local(line + (at + j + PIXELS * q) * 4, sum[q]);
+                }
             }
         }
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -785,7 +851,7 @@ __kernel void pyramid_expand(__global float *restrict blur, const __global int4 
 /* --- blending (section 3.5) --- */
 
 /* Divide PIXELS pixels by coverage and store them at the place the guard band leaves. */
-static inline void store_finished(__global float *out, floatn v, PyramidSize size, int x, int y)
+INLINE void store_finished(__global float *out, floatn v, PyramidSize size, int x, int y)
 {
     const int ox = x - size.guard, oy = y - size.guard;
     const int width = size.width - 2 * size.guard, height = size.height - 2 * size.guard;
@@ -838,8 +904,9 @@ __kernel void pyramid_blend(__global float *restrict out, const __global float *
             const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
             floatn quad[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
             if (sub.y == 0) {
-                if (!add_matted(quad, flat, flat_inv, slope, broad, span, fill, fill_inv, sub, level, size,
-                                ramps_of(matting, i), x, y)) continue;
+                const PyramidRamps ramps = ramps_of(matting, i);
+                if (!add_matted(quad, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x, y,
+                                block_of(span, size, ramps, x, y))) continue;
             } else {
                 const Between rows = between(level, y + sub.x);
                 expand_pixels(quad, blur, rows, (x + sub.x) / 2);
