@@ -7,12 +7,13 @@ ARGS ?=
 
 export PYTHON
 
-.PHONY: help demo test test-devices test-cpus gpu-check test-oclgrind stability mutants bench lint clean
+.PHONY: help demo test test-install test-devices test-cpus gpu-check test-oclgrind stability mutants bench lint clean
 
 help:
 	@echo "make demo   render a built-in scene to out/demo.png (and out/demo-pinhole.png beside it)"
 	@echo "make test   run all tests          (ARGS='-k lens' picks some)"
 	@echo "make stability  hard cases on every device, measured into docs/stability.md"
+	@echo "make test-install   wheel and sdist in clean environments, and what they require on four systems (3 minutes)"
 	@echo "make test-devices   the kernel and method tests on every OpenCL driver that can be installed, and how they agree"
 	@echo "make test-cpus      every kernel as other x86-64 processors and Debian's PoCL have it (under 15 minutes)"
 	@echo "make gpu-check      a GPU in eight minutes: pictures, speed, kernel tests, one JSON (DEVICE= picks)"
@@ -38,6 +39,10 @@ stability:
 	@scripts/setup.sh test
 	CLDOF_STABILITY=bench/results/stability.json $(VENV)/python -m pytest tests/hard_cases $(ARGS)
 	$(VENV)/python -m bench.stability
+
+test-install:
+	@scripts/setup.sh test
+	$(VENV)/python -m tests.tools.install $(ARGS)
 
 test-devices:
 	@scripts/setup.sh test
