@@ -71,12 +71,13 @@ _BAR_FROM, _BAR_WIDTH = 16, 30
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code.
 
-    0: done. 2: the input, the machine or the output path did not allow it. 130: interrupted.
+    0: done. 1: the doctor found that no picture can be made here. 2: the input, the machine or the output path did
+    not allow it. 130: interrupted.
     """
     arguments = _parser().parse_args(argv)
-    run: Callable[[argparse.Namespace], None] = arguments.run
+    run: Callable[[argparse.Namespace], int | None] = arguments.run
     try:
-        run(arguments)
+        return run(arguments) or 0
     except CldofError as error:
         print(f"cldof: {error}", file=sys.stderr)
         return _EXIT_BAD_INPUT
@@ -86,7 +87,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("cldof: interrupted, nothing half-written.", file=sys.stderr)
         return _EXIT_INTERRUPTED
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -171,6 +171,16 @@ def _parser() -> argparse.ArgumentParser:
     bench.set_defaults(run=_bench)
     add_arguments(bench)
 
+    doctor = commands.add_parser(
+        "doctor",
+        help="what cldof needs, whether it is here, and whether each device makes the right pictures",
+        description="Look at packages, drivers and folders, and have each device render a small frame by every method, "
+        "in processes of their own. Exit code 0 if a picture can be made here, else 1.",
+    )
+    doctor.set_defaults(run=_doctor)
+    doctor.add_argument("--json", action="store_true", help="as JSON, for a report")
+    doctor.add_argument("--device", type=int, metavar="N", help="render on that one alone; see 'cldof devices'")
+    doctor.add_argument("--quiet", action="store_true", help="no progress")
     devices = commands.add_parser("devices", help="list OpenCL devices", description="List OpenCL devices.")
     devices.set_defaults(run=_devices)
     scenes = commands.add_parser("scenes", help="list built-in scenes", description="List built-in scenes.")
@@ -308,6 +318,12 @@ def _bench(arguments: argparse.Namespace) -> None:
     from .benchmark.command import bench
 
     bench(arguments)
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from .doctor.command import doctor
+
+    return doctor(as_json=arguments.json, device=arguments.device, quiet=arguments.quiet)
 
 
 def _devices(arguments: argparse.Namespace) -> None:
