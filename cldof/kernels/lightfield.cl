@@ -83,7 +83,6 @@
 #define GAP_TILE 16          /* px, of the tiles that the planner asks for */
 #define FOOTPRINT_PX 7.0f    /* a slot covers nothing farther from where it stands than its CoC and this */
 #define MIN_WEIGHT 1e-4f     /* of all views together: less is a pixel that no view sees */
-#define LANES ((int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 
 typedef struct {
     int width, height, pitch, peels;            /* of the layers, guard band included */
@@ -104,7 +103,7 @@ typedef struct {
     float radius; /* m, of the lens */
 } LightfieldLens;
 
-static inline float absolute(float v) { return v < 0.0f ? -v : v; }
+static inline float absolute_of(float v) { return v < 0.0f ? -v : v; }
 
 #if LIGHTFIELD_SPARSE
 /* Gaps of the tiles that row y of the frame goes through. */
@@ -158,22 +157,22 @@ static inline float edge_of(const __global float *inv_depth, LightfieldSize size
     float d = MAXFLOAT;
     if (w >= 0.0f) {
         d = coc_of(w, lens) - c;
-        if (absolute(d) <= SAME_SURFACE_PX) return d;
+        if (absolute_of(d) <= SAME_SURFACE_PX) return d;
     }
     /* Beside a silhouette in front of it a surface goes on in another peel. */
     float best = MAXFLOAT;
     for (int other = 0; other < size.peels; other++) {
         const float v = there[other * plane], e = coc_of(v, lens) - c;
-        best = other != m && v >= 0.0f && absolute(e) < absolute(best) ? e : best;
+        best = other != m && v >= 0.0f && absolute_of(e) < absolute_of(best) ? e : best;
     }
-    if (absolute(best) <= SAME_SURFACE_PX) return best;
-    if (absolute(d) > STEEP_PX) return MAXFLOAT;
+    if (absolute_of(best) <= SAME_SURFACE_PX) return best;
+    if (absolute_of(d) > STEEP_PX) return MAXFLOAT;
     const int ax = nx + dx, ay = ny + dy, bx = x - dx, by = y - dy;
     if (!is_in_layers(size, ax, ay) || !is_in_layers(size, bx, by)) return MAXFLOAT;
     const float ahead = inv_depth[m * plane + (size_t)ay * size.pitch + ax];
     const float behind = inv_depth[m * plane + (size_t)by * size.pitch + bx];
-    const int is_straight = ahead >= 0.0f && absolute(coc_of(ahead, lens) - c - 2.0f * d) <= STRAIGHT * absolute(d)
-                            && behind >= 0.0f && absolute(coc_of(behind, lens) - c + d) <= STRAIGHT * absolute(d);
+    const int is_straight = ahead >= 0.0f && absolute_of(coc_of(ahead, lens) - c - 2.0f * d) <= STRAIGHT * absolute_of(d)
+                            && behind >= 0.0f && absolute_of(coc_of(behind, lens) - c + d) <= STRAIGHT * absolute_of(d);
     return is_straight ? d : MAXFLOAT;
 }
 
@@ -184,7 +183,7 @@ static inline int is_on_surface(const __global float *inv_depth, LightfieldSize 
     if (!is_in_layers(size, x, y)) return 0;
     const __global float *there = inv_depth + (size_t)y * size.pitch + x;
     for (int m = 0; m < size.peels; m++, there += (size_t)size.height * size.pitch)
-        if (*there >= 0.0f && absolute(coc_of(*there, lens) - c) <= SAME_SURFACE_PX) return 1;
+        if (*there >= 0.0f && absolute_of(coc_of(*there, lens) - c) <= SAME_SURFACE_PX) return 1;
     return 0;
 }
 
@@ -246,34 +245,32 @@ static inline int is_glass(const __global float *color, LightfieldSize size, int
 /* Nothing at all: hides nothing, whatever its depth. */
 static inline int is_clear(const __global float *rgba) { return rgba[0] + rgba[1] + rgba[2] + rgba[3] <= 0.0f; }
 
-/* Sixteen inverse depths of a row from x on (a multiple of 16), and those one pixel to the left and right. */
-static inline float16 depths_at(const __global float *inv_depth, LightfieldSize size, int m, int x, int y)
+/* LANES inverse depths of a row from x on (a multiple of LANES), and those one pixel to the left and right. */
+static inline floatn depths_at(const __global float *inv_depth, LightfieldSize size, int m, int x, int y)
 {
-    if (y < 0 || y >= size.height) return (float16)(EMPTY);
-    return load_quad(inv_depth + ((size_t)m * size.height + y) * size.pitch + x);
+    if (y < 0 || y >= size.height) return (floatn)(EMPTY);
+    return load_lanes(inv_depth + ((size_t)m * size.height + y) * size.pitch + x);
 }
 
-static inline float16 depths_left(const __global float *inv_depth, LightfieldSize size, int m, int x, int y, float16 w)
+static inline floatn depths_left(const __global float *inv_depth, LightfieldSize size, int m, int x, int y, floatn w)
 {
     const float edge = x > 0 ? inv_depth[((size_t)m * size.height + y) * size.pitch + x - 1] : EMPTY;
-    return (float16)(edge, w.s0123, w.s456, w.s789a, w.sbcd, w.se);
+    return lanes_after(edge, w);
 }
 
-static inline float16 depths_right(const __global float *inv_depth, LightfieldSize size, int m, int x, int y, float16 w)
+static inline floatn depths_right(const __global float *inv_depth, LightfieldSize size, int m, int x, int y, floatn w)
 {
-    const float edge = x + 16 < size.pitch && y >= 0 && y < size.height
-                           ? inv_depth[((size_t)m * size.height + y) * size.pitch + x + 16] : EMPTY;
-    return (float16)(w.s1234, w.s567, w.s89ab, w.scdef, edge);
+    const float edge = x + LANES < size.pitch && y >= 0 && y < size.height
+                           ? inv_depth[((size_t)m * size.height + y) * size.pitch + x + LANES] : EMPTY;
+    return lanes_before(w, edge);
 }
 
-static inline float16 coc16(float16 w, LightfieldLens lens)
+static inline floatn coc_of_lanes(floatn w, LightfieldLens lens)
 {
-    float16 c = lens.c1 * w + lens.c0;
-    c = c < -MAX_COC_PX ? (float16)(-MAX_COC_PX) : c;
-    return c > MAX_COC_PX ? (float16)(MAX_COC_PX) : c;
+    floatn c = lens.c1 * w + lens.c0;
+    c = c < -MAX_COC_PX ? (floatn)(-MAX_COC_PX) : c;
+    return c > MAX_COC_PX ? (floatn)(MAX_COC_PX) : c;
 }
-
-static inline float16 absolute16(float16 v) { return v < 0.0f ? -v : v; }
 
 /* lightfield_tiles: range of the inverse depth of each tile, and whether the first peel is one surface there.
  * reads   inv_depth  float[peels][height][pitch]     1/m
@@ -290,7 +287,7 @@ __kernel void lightfield_tiles(__global float2 *restrict tiles, const __global f
     const int x1 = x0 + TILE < size.width ? x0 + TILE : size.width;
     const int y1 = y0 + TILE < size.height ? y0 + TILE : size.height;
     const __global float *peel = inv_depth + (size_t)m * size.height * size.pitch;
-    const float same = SAME_SURFACE_PX / (absolute(lens.c1) + 1e-30f);
+    const float same = SAME_SURFACE_PX / (absolute_of(lens.c1) + 1e-30f);
     float low = MAXFLOAT, high = EMPTY;
     int is_open = 0;
     for (int y = y0; y < y1; y++)
@@ -303,8 +300,8 @@ __kernel void lightfield_tiles(__global float2 *restrict tiles, const __global f
             }
             if (m == 0) {
                 is_open |= w < 0.0f;
-                if (x + 1 < size.width) is_open |= absolute(at[1] - w) > same;
-                if (y + 1 < size.height) is_open |= absolute(at[size.pitch] - w) > same;
+                if (x + 1 < size.width) is_open |= absolute_of(at[1] - w) > same;
+                if (y + 1 < size.height) is_open |= absolute_of(at[size.pitch] - w) > same;
 #if LIGHTFIELD_GLASS
                 is_open |= is_glass(color, size, 0, x, y);
 #endif
@@ -340,14 +337,14 @@ __kernel void lightfield_cull(__global uchar *restrict tile_open, const __global
             }
         if (!is_closed) break;
         /* 3 px for the reach of footprints. */
-        is_hidden = absolute(lens.c1) * (front.y - own.x) + 3.0f <= (float)(ring * TILE);
+        is_hidden = absolute_of(lens.c1) * (front.y - own.x) + 3.0f <= (float)(ring * TILE);
     }
     tile_open[line * size.tiles_x + tx] = !is_hidden;
 }
 
-static inline int16 edge_code16(float16 d)
+static inline intn edge_codes(floatn d)
 {
-    return convert_int16(d * EDGE_STEPS + (d < 0.0f ? (float16)(-0.5f) : (float16)(0.5f)));
+    return to_intn(d * EDGE_STEPS + (d < 0.0f ? (floatn)(-0.5f) : (floatn)(0.5f)));
 }
 
 /* lightfield_slots: the slots of a row of a peel that any view can see, packed to the front.
@@ -376,22 +373,22 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
     const size_t row = (size_t)line * size.pitch, peel = (size_t)size.height * size.pitch;
     const __global uchar *open = tile_open + (m * size.tiles_y + y / TILE) * size.tiles_x;
     int count = 0;
-    for (int x0 = 0; x0 < size.pitch; x0 += 16) {
-        const float16 w = depths_at(inv_depth, size, m, x0, y), c = coc16(w, lens);
-        const float16 above = depths_at(inv_depth, size, m, x0, y - 1);
-        const float16 below = depths_at(inv_depth, size, m, x0, y + 1);
-        const float16 left = depths_left(inv_depth, size, m, x0, y, w);
-        const float16 right = depths_right(inv_depth, size, m, x0, y, w);
-        const float16 diagonal = depths_right(inv_depth, size, m, x0, y + 1, below);
-        const float16 c_right = coc16(right, lens), c_below = coc16(below, lens);
-        const float16 d_left = coc16(left, lens) - c, d_right = c_right - c;
-        const float16 d_above = coc16(above, lens) - c, d_below = c_below - c;
-        const int16 is_here = w >= 0.0f;
-        const float16 similar = SIMILAR_PX + SIMILAR_SHARE * absolute16(c);
-        const int16 is_cell = is_here & (right >= 0.0f) & (below >= 0.0f) & (diagonal >= 0.0f)
-                              & (absolute16(d_right) <= similar) & (absolute16(d_below) <= similar)
-                              & (absolute16(coc16(diagonal, lens) - c) <= similar);
-        for (int i = 0; i < 16; i++) {
+    for (int x0 = 0; x0 < size.pitch; x0 += LANES) {
+        const floatn w = depths_at(inv_depth, size, m, x0, y), c = coc_of_lanes(w, lens);
+        const floatn above = depths_at(inv_depth, size, m, x0, y - 1);
+        const floatn below = depths_at(inv_depth, size, m, x0, y + 1);
+        const floatn left = depths_left(inv_depth, size, m, x0, y, w);
+        const floatn right = depths_right(inv_depth, size, m, x0, y, w);
+        const floatn diagonal = depths_right(inv_depth, size, m, x0, y + 1, below);
+        const floatn c_right = coc_of_lanes(right, lens), c_below = coc_of_lanes(below, lens);
+        const floatn d_left = coc_of_lanes(left, lens) - c, d_right = c_right - c;
+        const floatn d_above = coc_of_lanes(above, lens) - c, d_below = c_below - c;
+        const intn is_here = w >= 0.0f;
+        const floatn similar = SIMILAR_PX + SIMILAR_SHARE * absolute(c);
+        const intn is_cell = is_here & (right >= 0.0f) & (below >= 0.0f) & (diagonal >= 0.0f)
+                              & (absolute(d_right) <= similar) & (absolute(d_below) <= similar)
+                              & (absolute(coc_of_lanes(diagonal, lens) - c) <= similar);
+        for (int i = 0; i < LANES; i++) {
             int flag = ((const int *)&is_cell)[i] ? 1 : 0;
 #if LIGHTFIELD_GLASS
             if (flag) { /* so x0 + i and y are not the last */
@@ -405,20 +402,18 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
             cells[row + x0 + i] = (uchar)flag;
         }
         int is_open = 0;
-        for (int t = x0 / TILE; t < x0 / TILE + 16 / TILE && t < size.tiles_x; t++) is_open |= open[t];
+        for (int t = x0 / TILE; t <= (x0 + LANES - 1) / TILE && t < size.tiles_x; t++) is_open |= open[t];
         if (!is_open) continue;
 #if LIGHTFIELD_SPARSE
-        const int16 arrives = absolute16(c) + FOOTPRINT_PX >= (float)gaps_of_row(gaps, size, y)[x0 / GAP_TILE];
-        const int8 eight = arrives.lo | arrives.hi;
-        const int4 four = eight.lo | eight.hi;
-        if (!(four.x | four.y | four.z | four.w)) continue;
+        const intn arrives = absolute(c) + FOOTPRINT_PX >= (float)gaps_of_row(gaps, size, y)[x0 / GAP_TILE];
+        if (!any_lane(arrives)) continue;
 #endif
-        const int16 is_plain = is_here & (left >= 0.0f) & (right >= 0.0f) & (above >= 0.0f) & (below >= 0.0f)
-                               & (absolute16(d_left) <= SAME_SURFACE_PX) & (absolute16(d_right) <= SAME_SURFACE_PX)
-                               & (absolute16(d_above) <= SAME_SURFACE_PX) & (absolute16(d_below) <= SAME_SURFACE_PX);
-        const int16 edges = (edge_code16(d_left) & 255) | (edge_code16(d_right) & 255) << 8
-                            | (edge_code16(d_above) & 255) << 16 | edge_code16(d_below) << 24;
-        for (int i = 0; i < 16 && x0 + i < size.width; i++) {
+        const intn is_plain = is_here & (left >= 0.0f) & (right >= 0.0f) & (above >= 0.0f) & (below >= 0.0f)
+                               & (absolute(d_left) <= SAME_SURFACE_PX) & (absolute(d_right) <= SAME_SURFACE_PX)
+                               & (absolute(d_above) <= SAME_SURFACE_PX) & (absolute(d_below) <= SAME_SURFACE_PX);
+        const intn edges = (edge_codes(d_left) & 255) | (edge_codes(d_right) & 255) << 8
+                            | (edge_codes(d_above) & 255) << 16 | edge_codes(d_below) << 24;
+        for (int i = 0; i < LANES && x0 + i < size.width; i++) {
             const int x = x0 + i;
             const float depth = ((const float *)&w)[i];
             if (depth < 0.0f || !open[x / TILE]) continue;
@@ -490,21 +485,21 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
 #define LARGER(a, b) ((a) > (b) ? (a) : (b))
 
 /* Pixels of the view that slots cover: columns x0 to before x1, rows y0 to before y1. Rows and columns of a slope shear
- * against each other; the widest edge across covers what opens between them. INT is int or int16. */
+ * against each other; the widest edge across covers what opens between them. INT is int or intn. */
 #define FOOTPRINT(INT, TO_INT, TO_FLOAT, column, row_y, coc, edge, v)                                                 \
     const INT at_x = ((column) << 8) + TO_INT((coc) * (v).x) + (int)(v).z;                                            \
     const INT at_y = ((row_y) << 8) + TO_INT((coc) * (v).y) + (int)(v).w;                                             \
     const INT l = EDGE_BYTE(edge, 0), r = EDGE_BYTE(edge, 8), u = EDGE_BYTE(edge, 16), d = EDGE_BYTE(edge, 24);       \
     const float slope_x = 8.0f * (v).x, slope_y = 8.0f * (v).y;                                                       \
-    const INT shear_x = TO_INT(TO_FLOAT(LARGER(KNOWN_EDGE(u), KNOWN_EDGE(d))) * absolute(slope_x));                   \
-    const INT shear_y = TO_INT(TO_FLOAT(LARGER(KNOWN_EDGE(l), KNOWN_EDGE(r))) * absolute(slope_y));                   \
+    const INT shear_x = TO_INT(TO_FLOAT(LARGER(KNOWN_EDGE(u), KNOWN_EDGE(d))) * absolute_of(slope_x));                   \
+    const INT shear_y = TO_INT(TO_FLOAT(LARGER(KNOWN_EDGE(l), KNOWN_EDGE(r))) * absolute_of(slope_y));                   \
     const int place_x = (int)(v).z, place_y = (int)(v).w;                                                             \
     SPAN(INT, x0, x1, at_x, EDGE_REACH(l, -TO_INT(TO_FLOAT(l) * slope_x), shear_x, place_x),                          \
          EDGE_REACH(r, TO_INT(TO_FLOAT(r) * slope_x), shear_x, -place_x))                                             \
     SPAN(INT, y0, y1, at_y, EDGE_REACH(u, -TO_INT(TO_FLOAT(u) * slope_y), shear_y, place_y),                          \
          EDGE_REACH(d, TO_INT(TO_FLOAT(d) * slope_y), shear_y, -place_y))
 
-static inline int16 load_ints(const __global uint *p) { return as_int16(load_quad((const __global float *)p)); }
+static inline intn load_ints(const __global uint *p) { return as_intn(load_lanes((const __global float *)p)); }
 
 /* lightfield_views: the nearest slot of every pixel of a view. The form for CPUs.
  * source  Yu, Wang & Yu 2010, section 3.2, eq. 4
@@ -548,16 +543,16 @@ __kernel void lightfield_views(__global ulong *restrict winners, const __global 
             const int line = m * size.height + y;
             const int count = slot_count[line];
             const size_t row = (size_t)line * size.pitch;
-            for (int b = 0; b < count; b += 16) {
-                const int16 at = load_ints(slot_at + row + b), edge = load_ints(slot_edge + row + b);
-                const float16 coc = load_quad(slot_coc + row + b);
-                const int16 column = at - (int)row - size.guard;
-                FOOTPRINT(int16, convert_int16, convert_float16, column, (int16)(y - size.guard), coc, edge, v)
-                const int16 lefts = LARGER(x0, 0), rights = x1 < size.out_width ? x1 : size.out_width;
-                const int16 uppers = LARGER(y0, top), lowers = y1 < bottom ? y1 : bottom;
-                const int16 is_pixel = (rights - lefts == 1) & (lowers - uppers == 1);
-                const int16 pixels = uppers * size.out_pitch + lefts;
-                const int n = count - b < 16 ? count - b : 16;
+            for (int b = 0; b < count; b += LANES) {
+                const intn at = load_ints(slot_at + row + b), edge = load_ints(slot_edge + row + b);
+                const floatn coc = load_lanes(slot_coc + row + b);
+                const intn column = at - (int)row - size.guard;
+                FOOTPRINT(intn, to_intn, to_floatn, column, (intn)(y - size.guard), coc, edge, v)
+                const intn lefts = LARGER(x0, 0), rights = x1 < size.out_width ? x1 : size.out_width;
+                const intn uppers = LARGER(y0, top), lowers = y1 < bottom ? y1 : bottom;
+                const intn is_pixel = (rights - lefts == 1) & (lowers - uppers == 1);
+                const intn pixels = uppers * size.out_pitch + lefts;
+                const int n = count - b < LANES ? count - b : LANES;
                 for (int i = 0; i < n; i++) {
                     const ulong key = (ulong)slot_key[row + b + i] << 32 | slot_at[row + b + i];
 #if LIGHTFIELD_GLASS
@@ -658,7 +653,7 @@ __kernel void lightfield_packed(__global uint *restrict winners, const __global 
 /* Whether two inverse depths are near enough for their colours to be mixed; c is the CoC of w. */
 static inline int is_similar(float other, float w, float c, LightfieldLens lens)
 {
-    return other >= 0.0f && absolute(lens.c1) * absolute(other - w) <= SIMILAR_PX + SIMILAR_SHARE * absolute(c);
+    return other >= 0.0f && absolute_of(lens.c1) * absolute_of(other - w) <= SIMILAR_PX + SIMILAR_SHARE * absolute_of(c);
 }
 
 /* Glass and what is not are never mixed: an opaque surface would let light through. */
@@ -699,7 +694,7 @@ static inline float4 jittered_color(const __global float *color, const __global 
                                     uint seed)
 {
     const float4 base = load_pixel(color + (((size_t)m * size.height + y) * size.width + x) * 4);
-    const float width = 2.0f * absolute(c) * lens.cell;
+    const float width = 2.0f * absolute_of(c) * lens.cell;
     seed = (seed ^ seed >> 16) * 0x7feb352du;
     seed = (seed ^ seed >> 15) * 0x846ca68bu;
     seed ^= seed >> 16;
@@ -826,7 +821,7 @@ static inline float4 ray_color(const __global float *color, const __global float
     const int line = at / (uint)size.pitch, x = at - line * size.pitch;
     const int m = line / size.height, y = line - m * size.height;
 #if LIGHTFIELD_LEVELS
-    const float width = absolute(c) * lens.cell;
+    const float width = absolute_of(c) * lens.cell;
     const float4 base = LIGHTFIELD_GLASS ? load_pixel(color + ((size_t)line * size.width + x) * 4) : (float4)(1.0f);
     int level = 0;
     /* The nearest whole level: log2(width) rounded. */
@@ -846,41 +841,37 @@ static inline float4 ray_color(const __global float *color, const __global float
 }
 
 #if LIGHTFIELD_SHADED
-static inline int is_run(int16 at)
+static inline int is_run(intn at)
 {
-    const int16 off = at - at.s0 - LANES;
-    const int8 eight = off.lo | off.hi;
-    const int4 four = eight.lo | eight.hi;
-    return !(four.x | four.y | four.z | four.w);
+    const intn off = at - at.s0 - LANE_INDEX;
+    return !any_lane(off);
 }
 
-static inline float16 between(float16 a, float16 b, float16 c, float16 d, float16 fx, float16 fy)
+static inline floatn between(floatn a, floatn b, floatn c, floatn d, floatn fx, floatn fy)
 {
-    const float16 above = a + fx * (b - a), below = c + fx * (d - c);
+    const floatn above = a + fx * (b - a), below = c + fx * (d - c);
     return above + fy * (below - above);
 }
 
-/* What sixteen rays find mirrored where they hit, from the surface buffers: normals between the corners of a cell that
+/* What LANES rays find mirrored where they hit, from the surface buffers: normals between the corners of a cell that
  * is one surface, everything else at the winner. Without that, curved things mirror in facets of a pixel each.
  * `at` and `cell` are places of winners and cells, `peel_at` where their peel starts; is_cell: -1 where a cell is one
  * surface. */
-static inline void mirrored(float4 found[16], const uint2 hits[16], int end, int16 at, int16 cell, int16 peel_at,
-                            int16 is_cell, int peel, int pitch, int16 ray_x, int16 ray_y, float16 fx, float16 fy,
-                            float16 w SHADE_PARAMS)
+static inline void mirrored(float4 found[LANES], const uint2 hits[LANES], int end, intn at, intn cell, intn peel_at,
+                            intn is_cell, int peel, int pitch, intn ray_x, intn ray_y, floatn fx, floatn fy,
+                            floatn w SHADE_PARAMS)
 {
-    float16 normal[3], rest[SURFACE_PLANES - 3];
-    const int8 eight = is_cell.lo & is_cell.hi;
-    const int4 four = eight.lo & eight.hi;
-    if (end == 16 && (four.x & four.y & four.z & four.w) && is_run(at) && is_run(cell)) {
+    floatn normal[3], rest[SURFACE_PLANES - 3];
+    if (end == LANES && !any_lane(~is_cell) && is_run(at) && is_run(cell)) {
         const __global float *base = surface + (size_t)(SURFACE_PLANES - 1) * peel_at.s0;
         for (int p = 0; p < 3; p++) {
             const __global float *n = base + (size_t)p * peel + cell.s0;
-            normal[p] = between(load_quad(n), load_quad(n + 1), load_quad(n + pitch), load_quad(n + pitch + 1), fx, fy);
+            normal[p] = between(load_lanes(n), load_lanes(n + 1), load_lanes(n + pitch), load_lanes(n + pitch + 1), fx, fy);
         }
-        for (int p = 3; p < SURFACE_PLANES; p++) rest[p - 3] = load_quad(base + (size_t)p * peel + at.s0);
+        for (int p = 3; p < SURFACE_PLANES; p++) rest[p - 3] = load_lanes(base + (size_t)p * peel + at.s0);
     } else {
-        float16 corner[3][4];
-        for (int i = 0; i < 16; i++) {
+        floatn corner[3][4];
+        for (int i = 0; i < LANES; i++) {
             const int is_hit = i < end && hits[i].x != NONE, is_smooth = ((const int *)&is_cell)[i];
             const __global float *base = surface
                                          + (is_hit ? (size_t)(SURFACE_PLANES - 1) * ((const int *)&peel_at)[i] : 0);
@@ -898,11 +889,11 @@ static inline void mirrored(float4 found[16], const uint2 hits[16], int end, int
         }
         for (int p = 0; p < 3; p++) normal[p] = between(corner[p][0], corner[p][1], corner[p][2], corner[p][3], fx, fy);
     }
-    if (!(sum16(rest[0] + rest[1] + rest[2]) > 0.0f)) return;
-    const float16 square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
-    const float16 unit = square > 1e-12f ? shading_rsqrt(square) : (float16)(0.0f);
-    const Shading3 position = shading_position(lighting, convert_float16(ray_x) * (1.0f / SUB) + 0.5f,
-                                               convert_float16(ray_y) * (1.0f / SUB) + 0.5f, w);
+    if (!(sum_lanes(rest[0] + rest[1] + rest[2]) > 0.0f)) return;
+    const floatn square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
+    const floatn unit = square > 1e-12f ? shading_rsqrt(square) : (floatn)(0.0f);
+    const Shading3 position = shading_position(lighting, to_floatn(ray_x) * (1.0f / SUB) + 0.5f,
+                                               to_floatn(ray_y) * (1.0f / SUB) + 0.5f, w);
     const Shading3 n = shading_3(normal[0] * unit, normal[1] * unit, normal[2] * unit);
     const Shading3 light = shading_specular(position, n, shading_3(rest[0], rest[1], rest[2]), rest[3], eye, lighting,
                                             environment);
@@ -926,7 +917,7 @@ static inline int is_beyond(const __global float *color, const __global float *i
     const float to_x = -lens.c1 * v_x, to_y = -lens.c1 * v_y; /* px per 1/m towards the lens */
     const float room_x = to_x < 0.0f ? hit_x + 0.5f - EDGE_PX : (float)size.width - 0.5f - EDGE_PX - hit_x;
     const float room_y = to_y < 0.0f ? hit_y + 0.5f - EDGE_PX : (float)size.height - 0.5f - EDGE_PX - hit_y;
-    const float speed_x = absolute(to_x), speed_y = absolute(to_y);
+    const float speed_x = absolute_of(to_x), speed_y = absolute_of(to_y);
     const float in_x = speed_x > 1e-12f ? room_x / speed_x : MAXFLOAT;
     const float in_y = speed_y > 1e-12f ? room_y / speed_y : MAXFLOAT;
     float t = in_x < in_y ? in_x : in_y;
@@ -942,9 +933,9 @@ static inline int is_beyond(const __global float *color, const __global float *i
     return 0;
 }
 
-/* Colours of sixteen rays of a view, side by side, from their winners; `end` of them count. (left, top) is the first
+/* Colours of LANES rays of a view, side by side, from their winners; `end` of them count. (left, top) is the first
  * one's place in the reference view in 1/256 px. Holes are left as they are. False if all are holes. */
-static inline int ray_colors(float4 found[16], uint2 hits[16], const __global uint2 *winners, int end,
+static inline int ray_colors(float4 found[LANES], uint2 hits[LANES], const __global uint2 *winners, int end,
                              const __global float *color, const __global float *inv_depth,
                              const __global uchar *cells, LightfieldSize size, LightfieldLens lens, int left, int top,
                              LightfieldView v, uint seed MIP_PARAMS SHADE_PARAMS)
@@ -952,29 +943,29 @@ static inline int ray_colors(float4 found[16], uint2 hits[16], const __global ui
     const float shift_x = SUB * v.x, shift_y = SUB * v.y;
     /* Addresses of all at once, colours one by one. */
     uint any = 0;
-    int16 key, at;
+    intn key, at;
     for (int i = 0; i < end; i++) {
         hits[i] = winners[i];
         any |= hits[i].x ^ NONE;
     }
     if (!any) return 0;
-    if (end == 16) {
-        const float16 low = load_quad((const __global float *)winners);
-        const float16 high = load_quad((const __global float *)(winners + 8));
-        at = as_int16((float16)(low.even, high.even));
-        key = as_int16((float16)(low.odd, high.odd));
+    if (end == LANES) {
+        const floatn low = load_lanes((const __global float *)winners);
+        const floatn high = load_lanes((const __global float *)(winners + LANES / 2));
+        at = as_intn((floatn)(low.even, high.even));
+        key = as_intn((floatn)(low.odd, high.odd));
     } else {
-        at = key = (int16)((int)NONE);
+        at = key = (intn)((int)NONE);
         for (int i = 0; i < end; i++) {
             ((int *)&at)[i] = (int)hits[i].x;
             ((int *)&key)[i] = (int)hits[i].y;
         }
     }
     const int peel = size.height * size.pitch, color_peel = size.height * size.width;
-    const float16 w = as_float16(~key & 0x7fffffff), c = coc16(w, lens);
-    const int16 ray_x = left + (LANES << 8) - convert_int16(c * shift_x);
-    const int16 ray_y = top - convert_int16(c * shift_y);
-    const int16 cell_x = ray_x >> 8, cell_y = ray_y >> 8;
+    const floatn w = as_floatn(~key & 0x7fffffff), c = coc_of_lanes(w, lens);
+    const intn ray_x = left + (LANE_INDEX << 8) - to_intn(c * shift_x);
+    const intn ray_y = top - to_intn(c * shift_y);
+    const intn cell_x = ray_x >> 8, cell_y = ray_y >> 8;
     if ((left >> 8) < lens.reach || (left >> 8) + end + lens.reach > size.width || (top >> 8) < lens.reach
         || (top >> 8) + 1 + lens.reach > size.height) {
         any = 0;
@@ -988,24 +979,24 @@ static inline int ray_colors(float4 found[16], uint2 hits[16], const __global ui
         }
         if (!any) return 0;
     }
-    int16 peel_at = 0, color_at = 0;
+    intn peel_at = 0, color_at = 0;
     for (int m = 1; m < size.peels; m++) {
-        const int16 is_behind = at >= m * peel;
-        peel_at = is_behind ? (int16)(m * peel) : peel_at;
-        color_at = is_behind ? (int16)(m * color_peel) : color_at;
+        const intn is_behind = at >= m * peel;
+        peel_at = is_behind ? (intn)(m * peel) : peel_at;
+        color_at = is_behind ? (intn)(m * color_peel) : color_at;
     }
-    const int16 cell = peel_at + cell_y * size.pitch + cell_x;
+    const intn cell = peel_at + cell_y * size.pitch + cell_x;
     color_at += cell_y * size.width + cell_x;
     /* The winner has to be one of the cell's four corners. */
-    const int16 off = at - cell;
-    int16 is_plain = (cell_x >= 0) & (cell_x + 1 < size.width) & (cell_y >= 0) & (cell_y + 1 < size.height)
+    const intn off = at - cell;
+    intn is_plain = (cell_x >= 0) & (cell_x + 1 < size.width) & (cell_y >= 0) & (cell_y + 1 < size.height)
                      & ((off == 0) | (off == 1) | (off == size.pitch) | (off == size.pitch + 1));
 #if LIGHTFIELD_LEVELS
-    is_plain &= absolute16(c) * lens.cell < 1.41421356f;
+    is_plain &= absolute(c) * lens.cell < 1.41421356f;
 #endif
-    const float16 fx = convert_float16(ray_x & 255) * (1.0f / SUB);
-    const float16 fy = convert_float16(ray_y & 255) * (1.0f / SUB);
-    int16 is_cell = 0;
+    const floatn fx = to_floatn(ray_x & 255) * (1.0f / SUB);
+    const floatn fy = to_floatn(ray_y & 255) * (1.0f / SUB);
+    intn is_cell = 0;
     for (int i = 0; i < end; i++) {
         if (hits[i].x == NONE) continue;
         if (LIGHTFIELD_LOOKUP == 1 && ((const int *)&is_plain)[i] && cells[((const int *)&cell)[i]]) {
@@ -1103,10 +1094,10 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
         const float4 eye = shading_eye(lighting, v.x * lens.radius, -v.y * lens.radius);
 #endif
         const int left = (x0 + size.guard) << 8, top = (y + size.guard) << 8;
-        for (int b = 0; b < n; b += 16) {
-            const int end = n - b < 16 ? n - b : 16;
-            float4 found[16];
-            uint2 hits[16];
+        for (int b = 0; b < n; b += LANES) {
+            const int end = n - b < LANES ? n - b : LANES;
+            float4 found[LANES];
+            uint2 hits[LANES];
 #define RAYS_OF(colors, winners_of, plane)                                                                            \
     ray_colors(colors, winners_of, own + (plane) * plane_size + b, end, color, inv_depth, cells, size, lens,          \
                left + (b << 8), top, v, seed + b MIP_ARGS SHADE_ARGS)
@@ -1114,8 +1105,8 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
             /* Rays that meet glass before what hides the rest: the panes over one another, then what is behind. A hole
              * behind glass counts as far as the glass covers it; or, if the frame lets the void through, as the void:
              * behind the last peel there is no slot for it. */
-            float4 panes[LIGHTFIELD_GLASS + 1][16];
-            uint2 pane_hits[LIGHTFIELD_GLASS + 1][16];
+            float4 panes[LIGHTFIELD_GLASS + 1][LANES];
+            uint2 pane_hits[LIGHTFIELD_GLASS + 1][LANES];
             int has_pane[LIGHTFIELD_GLASS + 1];
             if (!RAYS_OF(found, hits, 0))
                 for (int i = 0; i < end; i++) hits[i] = (uint2)(NONE);
@@ -1135,7 +1126,7 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
                     last = pane_hits[next][i];
                     ray += (1.0f - ray.w) * panes[next][i];
                 }
-                weights[b + i] += !is_hole || (LIGHTFIELD_VOID && ray.w > 0.0f) ? weight : weight * ray.w;
+                weights[b + i] += !is_hole || (LIGHTFIELD_VOID != 0 && ray.w > 0.0f) ? weight : weight * ray.w;
                 if (!is_hole) ray += (1.0f - ray.w) * found[i];
                 total[b + i] += weight * ray;
             }

@@ -43,7 +43,9 @@
 #ifndef MULTIVIEW_STRIDE
 #define MULTIVIEW_STRIDE 1
 #endif
+/* Pixels of a row that share the lists of their cells, and those that an item traces. */
 #define MULTIVIEW_SPAN (16 * MULTIVIEW_STRIDE)
+#define MULTIVIEW_AT_ONCE (LANES * MULTIVIEW_STRIDE)
 /* 1: rays walk the peels themselves; there is no stack of layers but for the void. */
 #ifndef MULTIVIEW_PEELED
 #define MULTIVIEW_PEELED 0
@@ -103,11 +105,11 @@ typedef struct {
 } MultiviewShift;
 
 /* Layers between the near end of the first layer and an inverse depth, with a fraction. */
-static inline float16 layer_at(float16 w, MultiviewSteps steps)
+static inline floatn layer_at(floatn w, MultiviewSteps steps)
 {
-    float16 c = steps.anchor - w, away = c < 0.0f ? -c : c;
-    float16 near = away < steps.turn ? away : (float16)(steps.turn);
-    float16 n = near / steps.fine + (away - near) / steps.coarse;
+    floatn c = steps.anchor - w, away = c < 0.0f ? -c : c;
+    floatn near = away < steps.turn ? away : (floatn)(steps.turn);
+    floatn n = near / steps.fine + (away - near) / steps.coarse;
     return (c < 0.0f ? -n : n) + steps.number;
 }
 
@@ -120,15 +122,15 @@ static inline float2 ends_of(const __global MultiviewPlaces *places, int s, int 
 /* How far a surface goes on behind a slot on its way to the next pixel, in 1/m: the lesser step of both sides, so that a
  * silhouette does not count, and nothing where neither side is connected or the slot sticks out from both: a lone pixel
  * just before a surface is no slope. `c1` px of C is one 1/m. */
-static inline float16 step_of(float16 w, float16 a, float16 b, float c1)
+static inline floatn step_of(floatn w, floatn a, floatn b, float c1)
 {
-    const float16 to_a = w > a ? w - a : a - w, to_b = w > b ? w - b : b - w;
-    const float16 px_a = a < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : to_a * (c1 < 0.0f ? -c1 : c1);
-    const float16 px_b = b < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : to_b * (c1 < 0.0f ? -c1 : c1);
-    const float16 least = px_a < px_b ? to_a : to_b;
-    const int16 a_joins = px_a <= MULTIVIEW_CONNECTED, b_joins = px_b <= MULTIVIEW_CONNECTED;
-    const int16 sticks_out = a_joins & b_joins & ((w - a) * (w - b) > 0.0f);
-    return (a_joins | b_joins) & ~sticks_out ? least : (float16)(0.0f);
+    const floatn to_a = w > a ? w - a : a - w, to_b = w > b ? w - b : b - w;
+    const floatn px_a = a < 0.0f ? (floatn)(MULTIVIEW_NOWHERE) : to_a * (c1 < 0.0f ? -c1 : c1);
+    const floatn px_b = b < 0.0f ? (floatn)(MULTIVIEW_NOWHERE) : to_b * (c1 < 0.0f ? -c1 : c1);
+    const floatn least = px_a < px_b ? to_a : to_b;
+    const intn a_joins = px_a <= MULTIVIEW_CONNECTED, b_joins = px_b <= MULTIVIEW_CONNECTED;
+    const intn sticks_out = a_joins & b_joins & ((w - a) * (w - b) > 0.0f);
+    return (a_joins | b_joins) & ~sticks_out ? least : (floatn)(0.0f);
 }
 
 /* multiview_place: keeps what depends on the lens where all passes of the frame find it.
@@ -144,23 +146,23 @@ __kernel void multiview_place(__global MultiviewPlaces *restrict places, Multivi
  * source  takes the place of the fixed 10 % overlap of layers, section 4.2
  * reads   inv_depth  float[peels][height][pitch]  1/m
  * writes  extent     float[peels][height][pitch]  1/m; MULTIVIEW_NOWHERE where nothing is
- * range   3-D, one item per 16 fine pixels of a row of a peel, any local size */
+ * range   3-D, one item per LANES fine pixels of a row of a peel, any local size */
 __kernel void multiview_extent(__global float *restrict extent, const __global float *restrict inv_depth,
                                MultiviewSize size, float c1)
 {
-    const int x = 16 * (int)get_global_id(0), y = get_global_id(1), m = get_global_id(2);
+    const int x = LANES * (int)get_global_id(0), y = get_global_id(1), m = get_global_id(2);
     if (x >= size.pitch || y >= size.height || m >= size.peels) return;
     const size_t at = ((size_t)m * size.height + y) * size.pitch + x;
     const __global float *inv = inv_depth + at;
-    const float16 none = (float16)(-1.0f);
-    float16 w = load_quad(inv);
+    const floatn none = (floatn)(-1.0f);
+    floatn w = load_lanes(inv);
     /* The ends of a row stand for their own neighbours. */
-    float16 left = x > 0 ? load_quad(inv - 1) : (float16)(none.s0, w.s01234567, w.s89ab, w.scd, w.se);
-    float16 right = x + 16 < size.pitch ? load_quad(inv + 1) : (float16)(w.s12345678, w.s9abc, w.sde, w.sf, none.s0);
-    float16 above = y > 0 ? load_quad(inv - size.pitch) : none;
-    float16 below = y + 1 < size.height ? load_quad(inv + size.pitch) : none;
-    float16 end = w - MULTIVIEW_GOES_ON * (step_of(w, left, right, c1) + step_of(w, above, below, c1));
-    store_quad(extent + at, w < 0.0f ? (float16)(MULTIVIEW_NOWHERE) : end);
+    floatn left = x > 0 ? load_lanes(inv - 1) : lanes_after(-1.0f, w);
+    floatn right = x + LANES < size.pitch ? load_lanes(inv + 1) : lanes_before(w, -1.0f);
+    floatn above = y > 0 ? load_lanes(inv - size.pitch) : none;
+    floatn below = y + 1 < size.height ? load_lanes(inv + size.pitch) : none;
+    floatn end = w - MULTIVIEW_GOES_ON * (step_of(w, left, right, c1) + step_of(w, above, below, c1));
+    store_lanes(extent + at, w < 0.0f ? (floatn)(MULTIVIEW_NOWHERE) : end);
 }
 
 /* multiview_cells: which layers have something in a cell; the first level of the N-buffer.
@@ -176,23 +178,23 @@ __kernel void multiview_cells(__global uint *restrict nbuffer, const __global fl
     if (cx >= size.cells_x || cy >= size.cells_y) return;
     const int y_end = (cy + 1) * MULTIVIEW_CELL < size.height ? (cy + 1) * MULTIVIEW_CELL : size.height;
     const float last = (float)(size.layers - 1);
-    uint16 mask = (uint16)(0u);
+    uintn mask = (uintn)(0u);
     for (int m = 0; m < size.peels; m++)
         for (int y = cy * MULTIVIEW_CELL; y < y_end; y++) {
-            const size_t at = ((size_t)m * size.height + y) * size.pitch + MULTIVIEW_CELL * cx;
-            float16 w = load_quad(inv_depth + at);
-            float16 from = layer_at(w, steps) - 1e-3f;
-            float16 to = layer_at(load_quad(extent + at), steps) + 1e-3f;
-            from = from < 0.0f ? (float16)(0.0f) : from;
-            from = from > last ? (float16)(last) : from;
-            to = to > last ? (float16)(last) : to;
-            to = to < from ? from : to;
-            uint16 bits = ((uint16)(2u) << convert_uint16(to)) - ((uint16)(1u) << convert_uint16(from));
-            mask |= w < 0.0f ? (uint16)(0u) : bits;
+            const size_t row = ((size_t)m * size.height + y) * size.pitch;
+            for (int x = cx * MULTIVIEW_CELL; x < (cx + 1) * MULTIVIEW_CELL; x += LANES) {
+                floatn w = load_lanes(inv_depth + row + x);
+                floatn from = layer_at(w, steps) - 1e-3f;
+                floatn to = layer_at(load_lanes(extent + row + x), steps) + 1e-3f;
+                from = from < 0.0f ? (floatn)(0.0f) : from;
+                from = from > last ? (floatn)(last) : from;
+                to = to > last ? (floatn)(last) : to;
+                to = to < from ? from : to;
+                uintn bits = ((uintn)(2u) << to_uintn(to)) - ((uintn)(1u) << to_uintn(from));
+                mask |= w < 0.0f ? (uintn)(0u) : bits;
+            }
         }
-    uint8 a = mask.lo | mask.hi;
-    uint4 b = a.lo | a.hi;
-    nbuffer[cy * size.cells_x + cx] = b.x | b.y | b.z | b.w;
+    nbuffer[cy * size.cells_x + cx] = or_lanes(mask);
 }
 
 /* multiview_nbuffer: one more level of the N-buffer: a cell holds what is in the 2^level x 2^level cells from it on.
@@ -364,6 +366,30 @@ __kernel void multiview_lists(__global uint *restrict lists, __global int *restr
     sets[cy * size.cells_x + cx] = set;
 }
 
+/* Over the values of a floatp. */
+static inline float sum_part(floatp v)
+{
+#if LANES == 16
+    return (v.x + v.y) + (v.z + v.w);
+#elif LANES == 8
+    return v.x + v.y;
+#else
+    return v;
+#endif
+}
+
+static inline float greatest_of_part(floatp v)
+{
+#if LANES == 16
+    const float2 two = v.lo < v.hi ? v.hi : v.lo;
+    return two.x < two.y ? two.y : two.x;
+#elif LANES == 8
+    return v.x < v.y ? v.y : v.x;
+#else
+    return v;
+#endif
+}
+
 /* multiview_split: one layer, the nearest slots inside it; several peels of glass one over the other.
  * source  eq. 4; exact where the paper's single pass may lose fragments of triangles that cross a bound
  * reads   color      float[peels][fine height][width][4]
@@ -385,39 +411,41 @@ __kernel void multiview_split(
                               const __global uint *restrict wanted, const __global MultiviewPlaces *restrict places,
                               MultiviewSize fine, int wanted_x, float c1, float c0, int layer, int slot)
 {
-    const int cx = get_global_id(0), cy = get_global_id(1), x = MULTIVIEW_CELL * cx;
+    const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= fine.cells_x || cy >= fine.cells_y) return;
     if (!(wanted[cy / MULTIVIEW_SCALE * wanted_x + cx / MULTIVIEW_SCALE] >> layer & 1u)) return;
     const int y_end = (cy + 1) * MULTIVIEW_CELL < fine.height ? (cy + 1) * MULTIVIEW_CELL : fine.height;
     const int peels = nbuffer[cy * fine.cells_x + cx] >> layer & 1u ? fine.peels : 0;
     const float2 ends = ends_of(places, layer, fine.layers);
-    float4 total = (float4)(0.0f), weights = (float4)(0.0f), most = (float4)(0.0f);
-    for (int y = cy * MULTIVIEW_CELL; y < y_end; y++) {
-        float16 quad[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+    floatp total = (floatp)(0.0f), weights = (floatp)(0.0f), most = (floatp)(0.0f);
+    for (int i = 0; i < (y_end - cy * MULTIVIEW_CELL) * (MULTIVIEW_CELL / LANES); i++) {
+        const int x = cx * MULTIVIEW_CELL + i % (MULTIVIEW_CELL / LANES) * LANES;
+        const int y = cy * MULTIVIEW_CELL + i / (MULTIVIEW_CELL / LANES);
+        floatn quad[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
         for (int m = 0; m < peels; m++) {
             const size_t row = (size_t)m * fine.height + y;
-            float16 w = load_quad(inv_depth + row * fine.pitch + x), c = w * c1 + c0;
-            float16 end = load_quad(extent + row * fine.pitch + x);
-            float16 in = w > ends.y && end <= ends.x ? (float16)(1.0f) : (float16)(0.0f);
-            if (sum16(in) == 0.0f) continue;
-            float16 own = w <= ends.x ? in : (float16)(0.0f);
+            floatn w = load_lanes(inv_depth + row * fine.pitch + x), c = w * c1 + c0;
+            floatn end = load_lanes(extent + row * fine.pitch + x);
+            floatn in = w > ends.y && end <= ends.x ? (floatn)(1.0f) : (floatn)(0.0f);
+            if (sum_lanes(in) == 0.0f) continue;
+            floatn own = w <= ends.x ? in : (floatn)(0.0f);
             const __global float *rgba = color + (row * fine.width + x) * 4;
-            const float4 ins[4] = {in.s0123, in.s4567, in.s89ab, in.scdef};
-            const float4 owns[4] = {own.s0123, own.s4567, own.s89ab, own.scdef};
-            const float4 cs[4] = {c.s0123, c.s4567, c.s89ab, c.scdef};
+            const floatp ins[4] = FOUR_PARTS(in);
+            const floatp owns[4] = FOUR_PARTS(own);
+            const floatp cs[4] = FOUR_PARTS(c);
 #pragma unroll
             for (int q = 0; q < 4; q++) {
-                const int valid = fine.width - x - 4 * q;
+                const int valid = fine.width - x - PIXELS * q;
                 if (valid <= 0) continue;
-                float16 v = valid >= 4 ? load_quad(rgba + 16 * q) : load_quad_part(rgba + 16 * q, valid);
-                float4 seen = 1.0f - quad[q].s37bf, light = v.s048c;
-                light = light < v.s159d ? v.s159d : light;
-                light = light < v.s26ae ? v.s26ae : light;
-                float4 pull = (light * light + 0.01f * v.s37bf) * seen * owns[q];
+                floatn v = load_pixels(rgba + LANES * q, valid);
+                floatp seen = 1.0f - quad[q].ALPHA, light = v.RED;
+                light = light < v.GREEN ? v.GREEN : light;
+                light = light < v.BLUE ? v.BLUE : light;
+                floatp pull = (light * light + 0.01f * v.ALPHA) * seen * owns[q];
                 /* An opaque slot may be met twice, glass must not. */
-                float4 weight = v.s37bf >= MULTIVIEW_OPAQUE ? ins[q] : owns[q];
+                floatp weight = v.ALPHA >= MULTIVIEW_OPAQUE ? ins[q] : owns[q];
                 quad[q] += v * spread(seen * weight);
-                total += owns[q] > 0.0f ? pull * cs[q] : (float4)(0.0f);
+                total += owns[q] > 0.0f ? pull * cs[q] : (floatp)(0.0f);
                 weights += pull;
                 light *= seen * owns[q];
                 most = most < light ? light : most;
@@ -426,13 +454,11 @@ __kernel void multiview_split(
 #if !MULTIVIEW_PEELED
         __global float *out = layers + (((size_t)slot * fine.height + y) * fine.pitch + x) * 4;
 #pragma unroll
-        for (int q = 0; q < 4; q++) store_quad(out + 16 * q, quad[q]);
+        for (int q = 0; q < 4; q++) store_lanes(out + LANES * q, quad[q]);
 #endif
     }
-    float2 most2 = most.lo < most.hi ? most.hi : most.lo;
     moments[((size_t)layer * fine.cells_y + cy) * fine.cells_x + cx] =
-        (float4)((total.x + total.y) + (total.z + total.w), (weights.x + weights.y) + (weights.z + weights.w),
-                 most2.x < most2.y ? most2.y : most2.x, 0.0f);
+        (float4)(sum_part(total), sum_part(weights), greatest_of_part(most), 0.0f);
 }
 
 /* multiview_past: where the void is seen past everything in a frame that is not opaque: in columns of peels that let
@@ -463,6 +489,8 @@ __kernel void multiview_past(__global float *restrict layers, const __global flo
         store_pixel(out + 4 * x, (float4)(0.0f, 0.0f, 0.0f, past));
     }
 }
+
+#define MULTIVIEW_PIXEL(i) p[i]
 
 /* multiview_cone: one layer as cones see it: the mean over a square window as wide as the cone is there.
  * source  section 4.4. All cones of a layer have the same width there, so that full-size means take the place of mip
@@ -504,20 +532,20 @@ __kernel void multiview_cone(__global float *restrict layers, const __global flo
     for (int y = cy * MULTIVIEW_CELL; y < y_end; y++) {
         __global float *out = layers + ((size_t)slot * size.height + y) * size.pitch * 4;
         if (is_empty) {
-            for (int x = x0; x < x1; x += 4) store_quad(out + x * 4, (float16)(0.0f));
+            for (int x = x0; x < x1; x += PIXELS) store_lanes(out + x * 4, (floatn)(0.0f));
             continue;
         }
         const int start = x0 * MULTIVIEW_SCALE - MULTIVIEW_HALO;
-        for (int j = 0; j < MULTIVIEW_SCALE * MULTIVIEW_RUN + 2 * MULTIVIEW_HALO; j += 4) {
+        for (int j = 0; j < MULTIVIEW_SCALE * MULTIVIEW_RUN + 2 * MULTIVIEW_HALO; j += PIXELS) {
             const int x = start + j;
-            float16 sum = (float16)(0.0f);
+            floatn sum = (floatn)(0.0f);
             if (x >= 0 && x < fine.pitch)
                 for (int t = -1; t <= taps; t++) {
                     const int from = clamp_index(y * MULTIVIEW_SCALE + first + t, fine.height - 1);
                     const float weight = t < 0 || t == taps ? edge : 1.0f;
-                    sum += (weight * scale) * load_quad(image + ((size_t)from * fine.pitch + x) * 4);
+                    sum += (weight * scale) * load_lanes(image + ((size_t)from * fine.pitch + x) * 4);
                 }
-            *(float16_unaligned *)(line + 4 * j) = sum;
+            store_lanes_private(line + 4 * j, sum);
         }
         /* Beyond the frame its edge goes on. */
         for (int j = 0; j < MULTIVIEW_SCALE * MULTIVIEW_RUN + 2 * MULTIVIEW_HALO; j++) {
@@ -525,82 +553,83 @@ __kernel void multiview_cone(__global float *restrict layers, const __global flo
             if (x != inside)
                 for (int c = 0; c < 4; c++) line[4 * j + c] = line[4 * (inside - start) + c];
         }
-        for (int x = x0; x < x1; x += 4) {
+        for (int x = x0; x < x1; x += PIXELS) {
             const float *at = line + 4 * (MULTIVIEW_HALO + (x - x0) * MULTIVIEW_SCALE + first);
 #if MULTIVIEW_SCALE == 1
-            float16 sum = edge * (*(const float16_unaligned *)(at - 4) + *(const float16_unaligned *)(at + 4 * taps));
-            for (int t = 0; t < taps; t++) sum += *(const float16_unaligned *)(at + 4 * t);
+            floatn sum = edge * (load_lanes_private(at - 4) + load_lanes_private(at + 4 * taps));
+            for (int t = 0; t < taps; t++) sum += load_lanes_private(at + 4 * t);
 #else
-            float4 p[4];
-            for (int j = 0; j < 4; j++, at += 4 * MULTIVIEW_SCALE) {
+            float4 p[PIXELS];
+            for (int j = 0; j < PIXELS; j++, at += 4 * MULTIVIEW_SCALE) {
                 p[j] = edge * (*(const float4_unaligned *)(at - 4) + *(const float4_unaligned *)(at + 4 * taps));
                 for (int t = 0; t < taps; t++) p[j] += *(const float4_unaligned *)(at + 4 * t);
             }
-            float16 sum = (float16)(p[0], p[1], p[2], p[3]);
+            floatn sum = PIXELS_OF(MULTIVIEW_PIXEL);
 #endif
-            store_quad(out + x * 4, sum * scale);
+            store_lanes(out + x * 4, sum * scale);
         }
     }
 }
 
 /* Four pixels of a layer, MULTIVIEW_STRIDE apart. */
-static inline float16 layer_quad(const __global float *p)
+static inline floatn layer_quad(const __global float *p)
 {
 #if MULTIVIEW_STRIDE == 1
-    return load_quad(p);
+    return load_lanes(p);
 #else
-    return (float16)(load_pixel(p), load_pixel(p + 4 * MULTIVIEW_STRIDE), load_pixel(p + 8 * MULTIVIEW_STRIDE),
-                     load_pixel(p + 12 * MULTIVIEW_STRIDE));
+#define MULTIVIEW_EVERY(i) load_pixel(p + 4 * (i) * MULTIVIEW_STRIDE)
+    return PIXELS_OF(MULTIVIEW_EVERY);
+#undef MULTIVIEW_EVERY
 #endif
 }
 
 /* The same at pixel x of a row, where some of them may lie outside of the frame. There its edge goes on, but of unknown
  * colour: rays that meet it are dropped. What is outside has a negative alpha. */
-static inline float16 edge_quad(const __global float *row, int x, int is_outside, int width)
+static inline floatn edge_quad(const __global float *row, int x, int is_outside, int width)
 {
-    float4 p[4];
-    for (int j = 0; j < 4; j++) {
+    float4 p[PIXELS];
+    for (int j = 0; j < PIXELS; j++) {
         const int at = x + j * MULTIVIEW_STRIDE, inside = clamp_index(at, width - 1);
         p[j] = load_pixel(row + 4 * inside);
         p[j] = at != inside || is_outside ? (float4)(0.0f, 0.0f, 0.0f, -p[j].w) : p[j];
     }
-    return (float16)(p[0], p[1], p[2], p[3]);
+    return PIXELS_OF(MULTIVIEW_PIXEL);
 }
 
 #if MULTIVIEW_PEELED
 /* One value of each pixel of a run; beyond the frame its edge goes on. */
-static inline float16 run_of(const __global float *row, int x, int is_inside, int width)
+static inline floatn run_of(const __global float *row, int x, int is_inside, int width)
 {
 #if MULTIVIEW_STRIDE == 1
-    if (is_inside) return load_quad(row + x);
+    if (is_inside) return load_lanes(row + x);
 #endif
-    float v[16];
-    for (int j = 0; j < 16; j++) v[j] = row[clamp_index(x + j * MULTIVIEW_STRIDE, width - 1)];
-    return *(const float16_unaligned *)v;
+    float v[LANES];
+    for (int j = 0; j < LANES; j++) v[j] = row[clamp_index(x + j * MULTIVIEW_STRIDE, width - 1)];
+    return load_lanes_private(v);
 }
 
 /* What multiview_split would have put into a layer for 16 pixels, straight from the peels. */
-static inline void peeled_quads(float16 quad[4], const __global float *color, const __global float *inv_depth,
+static inline void peeled_quads(floatn quad[4], const __global float *color, const __global float *inv_depth,
                                 const __global float *extent, MultiviewSize size, float2 ends, int x, int row,
                                 int is_inside, int is_outside)
 {
-    for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
+    for (int q = 0; q < 4; q++) quad[q] = (floatn)(0.0f);
     for (int m = 0; m < size.peels; m++) {
         const size_t line = (size_t)m * size.height + row;
-        float16 end = run_of(extent + line * size.pitch, x, is_inside, size.width);
-        float16 near = run_of(inv_depth + line * size.pitch, x, is_inside, size.width);
-        float16 in = near > ends.y && end <= ends.x ? (float16)(1.0f) : (float16)(0.0f);
-        if (sum16(in) == 0.0f) continue;
-        float16 own = near <= ends.x ? in : (float16)(0.0f);
+        floatn end = run_of(extent + line * size.pitch, x, is_inside, size.width);
+        floatn near = run_of(inv_depth + line * size.pitch, x, is_inside, size.width);
+        floatn in = near > ends.y && end <= ends.x ? (floatn)(1.0f) : (floatn)(0.0f);
+        if (sum_lanes(in) == 0.0f) continue;
+        floatn own = near <= ends.x ? in : (floatn)(0.0f);
         const __global float *rgba = color + line * size.width * 4;
-        const float4 ins[4] = {in.s0123, in.s4567, in.s89ab, in.scdef};
-        const float4 owns[4] = {own.s0123, own.s4567, own.s89ab, own.scdef};
+        const floatp ins[4] = FOUR_PARTS(in);
+        const floatp owns[4] = FOUR_PARTS(own);
         for (int q = 0; q < 4; q++) {
-            const int at = x + 4 * q * MULTIVIEW_STRIDE;
-            float16 v = is_inside ? layer_quad(rgba + at * 4) : edge_quad(rgba, at, is_outside, size.width);
-            float4 alpha = v.s37bf < 0.0f ? -v.s37bf : v.s37bf;
-            float4 weight = alpha >= MULTIVIEW_OPAQUE ? ins[q] : owns[q];
-            float4 covered = quad[q].s37bf < 0.0f ? -quad[q].s37bf : quad[q].s37bf;
+            const int at = x + PIXELS * q * MULTIVIEW_STRIDE;
+            floatn v = is_inside ? layer_quad(rgba + at * 4) : edge_quad(rgba, at, is_outside, size.width);
+            floatp alpha = v.ALPHA < 0.0f ? -v.ALPHA : v.ALPHA;
+            floatp weight = alpha >= MULTIVIEW_OPAQUE ? ins[q] : owns[q];
+            floatp covered = quad[q].ALPHA < 0.0f ? -quad[q].ALPHA : quad[q].ALPHA;
             quad[q] += v * spread((1.0f - covered) * weight);
         }
     }
@@ -609,15 +638,15 @@ static inline void peeled_quads(float16 quad[4], const __global float *color, co
 
 #if MULTIVIEW_PEELED && MULTIVIEW_REFINE
 /* C of the first slot with something between two C, for each pixel of a run; MULTIVIEW_NOWHERE where there is none. */
-static inline float16 first_between(const __global float *inv_depth, const __global float *extent, MultiviewSize size,
+static inline floatn first_between(const __global float *inv_depth, const __global float *extent, MultiviewSize size,
                                     float c1, float c0, float2 ends, int x, int row, int is_inside)
 {
-    float16 first = (float16)(MULTIVIEW_NOWHERE);
+    floatn first = (floatn)(MULTIVIEW_NOWHERE);
     for (int m = 0; m < size.peels; m++) {
         const size_t line = ((size_t)m * size.height + row) * size.pitch;
-        float16 near = run_of(inv_depth + line, x, is_inside, size.width);
-        float16 end = run_of(extent + line, x, is_inside, size.width);
-        near = near > ends.y && end <= ends.x ? near * c1 + c0 : (float16)(MULTIVIEW_NOWHERE);
+        floatn near = run_of(inv_depth + line, x, is_inside, size.width);
+        floatn end = run_of(extent + line, x, is_inside, size.width);
+        near = near > ends.y && end <= ends.x ? near * c1 + c0 : (floatn)(MULTIVIEW_NOWHERE);
         first = near < first ? near : first;
     }
     return first;
@@ -627,31 +656,31 @@ static inline float16 first_between(const __global float *inv_depth, const __glo
  * something between the layer's bounds, the half before or behind the middle is halved in turn. All rays of a run are
  * parallel: those in the same part of the layer have moved by the same whole number of pixels, and each part that some
  * of them are in is one contiguous look-up. */
-static inline void refined_quads(float16 quad[4], const __global float *color, const __global float *inv_depth,
+static inline void refined_quads(floatn quad[4], const __global float *color, const __global float *inv_depth,
                                  const __global float *extent, MultiviewSize size, float c1, float c0, float2 ends,
                                  float2 limits, float2 point, int x0, int y)
 {
-    for (int q = 0; q < 4; q++) quad[q] = (float16)(0.0f);
-    float16 part = (float16)(0.0f);
+    for (int q = 0; q < 4; q++) quad[q] = (floatn)(0.0f);
+    floatn part = (floatn)(0.0f);
     for (int level = 0; level <= MULTIVIEW_REFINE; level++) {
         const float length = (limits.y - limits.x) / (float)(1 << level);
-        float16 next = (float16)(-1.0f);
+        floatn next = (floatn)(-1.0f);
         for (int k = 0; k < 1 << level; k++) {
-            float16 is_here = part == (float)k ? (float16)(1.0f) : (float16)(0.0f);
-            if (sum16(is_here) == 0.0f) continue;
+            floatn is_here = part == (float)k ? (floatn)(1.0f) : (floatn)(0.0f);
+            if (sum_lanes(is_here) == 0.0f) continue;
             const float c = limits.x + ((float)k + 0.5f) * length;
             const int2 by = convert_int2_rtn(point * c + 0.5f);
             const int x = x0 + by.x, row = clamp_index(y + by.y, size.height - 1);
-            const int is_inside = x >= 0 && x + MULTIVIEW_SPAN <= size.width && row == y + by.y;
+            const int is_inside = x >= 0 && x + MULTIVIEW_AT_ONCE <= size.width && row == y + by.y;
             if (level < MULTIVIEW_REFINE) {
-                float16 first = first_between(inv_depth, extent, size, c1, c0, ends, x, row, is_inside);
-                float16 half_of = first < c ? (float16)(2.0f * k) : (float16)(2.0f * k + 1.0f);
-                if (level == 0) half_of = first < MULTIVIEW_NOWHERE ? half_of : (float16)(-1.0f);
+                floatn first = first_between(inv_depth, extent, size, c1, c0, ends, x, row, is_inside);
+                floatn half_of = first < c ? (floatn)(2.0f * k) : (floatn)(2.0f * k + 1.0f);
+                if (level == 0) half_of = first < MULTIVIEW_NOWHERE ? half_of : (floatn)(-1.0f);
                 next = is_here > 0.0f ? half_of : next;
             } else {
-                float16 met[4];
+                floatn met[4];
                 peeled_quads(met, color, inv_depth, extent, size, ends, x, row, is_inside, row != y + by.y);
-                const float4 here[4] = {is_here.s0123, is_here.s4567, is_here.s89ab, is_here.scdef};
+                const floatp here[4] = FOUR_PARTS(is_here);
                 for (int q = 0; q < 4; q++) quad[q] += met[q] * spread(here[q]);
             }
         }
@@ -708,7 +737,7 @@ __kernel void multiview_finish(__global float *restrict image, const __global fl
     }
 }
 
-/* multiview_trace: all rays of 16 pixels, front to back through the layers of their cells.
+/* multiview_trace: all rays of LANES pixels, front to back through the layers of their cells.
  * source  sections 4.3 and 4.4: v1 * c1 + (1 - v1) * c2
  * reads   layers    float[layers (+ 1)][height][pitch][4]
  *         color     float[peels][fine height][width][4]
@@ -722,7 +751,7 @@ __kernel void multiview_finish(__global float *restrict image, const __global fl
  *                   as they are
  * writes  image     float[output height][output width][4]; or, with MULTIVIEW_PARTS, adds to parts as multiview_finish
  *                   has them, or begins them with the `first` group
- * range   2-D, one item per MULTIVIEW_SPAN pixels of an output row, any local size */
+ * range   2-D, one item per MULTIVIEW_AT_ONCE pixels of a row, any local size */
 __kernel void multiview_trace(__global float *restrict image, const __global float *restrict layers,
                               const __global uint *restrict lists, const __global int *restrict sets,
                               const __global int2 *restrict ray_sets, const __global MultiviewShift *restrict shifts,
@@ -743,20 +772,21 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
 #endif
 )
 {
-    const int start = MULTIVIEW_SPAN * (int)get_global_id(0), y = (int)get_global_id(1) + guard;
+    const int start = MULTIVIEW_AT_ONCE * (int)get_global_id(0), y = (int)get_global_id(1) + guard;
     const int end_x = size.width - guard;
-    if (start >= end_x || start + MULTIVIEW_SPAN <= guard || y >= size.height - guard) return;
+    if (start >= end_x || start + MULTIVIEW_AT_ONCE <= guard || y >= size.height - guard) return;
+    const int first_cell = start / MULTIVIEW_SPAN * MULTIVIEW_STRIDE;
 #if MULTIVIEW_SPARSE
     const __global ushort *row_gaps = gaps + y / MULTIVIEW_CELL * size.cells_x;
     int is_asked_for = 0;
     for (int i = 0; i < MULTIVIEW_STRIDE; i++)
-        is_asked_for |= row_gaps[clamp_index(start / MULTIVIEW_CELL + i, size.cells_x - 1)] == 0;
+        is_asked_for |= row_gaps[clamp_index(first_cell + i, size.cells_x - 1)] == 0;
     if (!is_asked_for) return;
 #endif
     uint list = 0u;
     int set = 0;
     for (int i = 0; i < MULTIVIEW_STRIDE; i++) {
-        const int cx = clamp_index(start / MULTIVIEW_CELL + i, size.cells_x - 1);
+        const int cx = clamp_index(first_cell + i, size.cells_x - 1);
         const int cell = y / MULTIVIEW_CELL * size.cells_x + cx;
         list |= lists[cell];
         set = set > sets[cell] ? set : sets[cell];
@@ -769,13 +799,13 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
         const int x0 = start + phase;
         const int pattern = (set * MULTIVIEW_STRIDE + y % MULTIVIEW_STRIDE) * MULTIVIEW_STRIDE + phase;
         const int2 rays = ray_sets[pattern];
-        float16 sum[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+        floatn sum[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
 #if MULTIVIEW_VOID
-        float16 past[4] = {(float16)(0.0f), (float16)(0.0f), (float16)(0.0f), (float16)(0.0f)};
+        floatn past[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
 #endif
         for (int i = 0; i < rays.y; i++) {
             const __global MultiviewShift *shift = shifts + (size_t)(rays.x + i) * size.layers;
-            float16 left[4] = {(float16)(1.0f), (float16)(1.0f), (float16)(1.0f), (float16)(1.0f)};
+            floatn left[4] = {(floatn)(1.0f), (floatn)(1.0f), (floatn)(1.0f), (floatn)(1.0f)};
             float open = 1.0f;
             for (int k = 0; k < count + MULTIVIEW_VOID && open > 0.0f; k++) {
                 const int s = k < count ? order[k] : size.layers;
@@ -787,34 +817,34 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
                 const int over = by.to_x < 0.0f ? -1 : 1, down = by.to_y < 0.0f ? -1 : 1;
                 const int is_between = !MULTIVIEW_REFINE && (share_x > 0.0f || share_y > 0.0f);
                 const int rim = is_between ? 1 : 0;
-                const int is_inside = x >= rim && x + MULTIVIEW_SPAN + rim <= size.width && row >= rim &&
+                const int is_inside = x >= rim && x + MULTIVIEW_AT_ONCE + rim <= size.width && row >= rim &&
                                       row + rim < size.height;
                 const __global float *layer = layers + (MULTIVIEW_PEELED ? 0 : s) * layer_floats;
                 /* What the ray meets as far as it is known, and how much light that blocks. */
-                float16 c[4], blocks[4];
+                floatn c[4], blocks[4];
                 if (!MULTIVIEW_PEELED && is_inside) {
                     const __global float *at = layer + ((size_t)row * size.pitch + x) * 4;
 #pragma unroll
-                    for (int q = 0; q < 4; q++) c[q] = layer_quad(at + 16 * q * MULTIVIEW_STRIDE);
+                    for (int q = 0; q < 4; q++) c[q] = layer_quad(at + LANES * q * MULTIVIEW_STRIDE);
                     if (is_between) {
                         const __global float *side = at + 4 * over, *next = at + 4 * down * size.pitch;
                         const __global float *corner = next + 4 * over;
                         if (share_x > 0.0f)
 #pragma unroll
                             for (int q = 0; q < 4; q++)
-                                c[q] += share_x * (layer_quad(side + 16 * q * MULTIVIEW_STRIDE) - c[q]);
+                                c[q] += share_x * (layer_quad(side + LANES * q * MULTIVIEW_STRIDE) - c[q]);
                         if (share_y > 0.0f)
 #pragma unroll
                             for (int q = 0; q < 4; q++) {
-                                float16 v = layer_quad(next + 16 * q * MULTIVIEW_STRIDE);
-                                v += share_x * (layer_quad(corner + 16 * q * MULTIVIEW_STRIDE) - v);
+                                floatn v = layer_quad(next + LANES * q * MULTIVIEW_STRIDE);
+                                v += share_x * (layer_quad(corner + LANES * q * MULTIVIEW_STRIDE) - v);
                                 c[q] += share_y * (v - c[q]);
                             }
                     }
 #pragma unroll
-                    for (int q = 0; q < 4; q++) blocks[q] = c[q].s33337777bbbbffff;
+                    for (int q = 0; q < 4; q++) blocks[q] = c[q].ALPHAS;
                 } else {
-                    for (int q = 0; q < 4; q++) c[q] = (float16)(0.0f), blocks[q] = (float16)(0.0f);
+                    for (int q = 0; q < 4; q++) c[q] = (floatn)(0.0f), blocks[q] = (floatn)(0.0f);
                     for (int tap = 0; tap < (is_between ? 4 : 1); tap++) {
                         const int is_over = tap & 1, is_down = tap >> 1;
                         float share = 1.0f;
@@ -823,7 +853,7 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
                         if (share <= 0.0f) continue;
                         const int column = x + is_over * over, line = row + is_down * down;
                         const int inside = clamp_index(line, size.height - 1);
-                        float16 v[4];
+                        floatn v[4];
 #if MULTIVIEW_PEELED
                         if (s < size.layers) {
                             const float2 ends = ends_of(places, s, size.layers);
@@ -832,7 +862,7 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
                             refined_quads(v, color, inv_depth, extent, size, c1, c0, ends, limits, points[rays.x + i],
                                           x0, y);
 #else
-                            const int is_whole = column >= 0 && column + MULTIVIEW_SPAN <= size.width && line == inside;
+                            const int is_whole = column >= 0 && column + MULTIVIEW_AT_ONCE <= size.width && line == inside;
                             peeled_quads(v, color, inv_depth, extent, size, ends, column, inside, is_whole,
                                          line != inside);
 #endif
@@ -840,15 +870,15 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
 #endif
                             for (int q = 0; q < 4; q++)
                                 v[q] = edge_quad(layer + (size_t)inside * size.pitch * 4,
-                                                 column + 4 * q * MULTIVIEW_STRIDE, line != inside, size.width);
+                                                 column + PIXELS * q * MULTIVIEW_STRIDE, line != inside, size.width);
                         for (int q = 0; q < 4; q++) {
-                            float16 alpha = v[q].s33337777bbbbffff;
-                            c[q] += alpha < 0.0f ? (float16)(0.0f) : share * v[q];
+                            floatn alpha = v[q].ALPHAS;
+                            c[q] += alpha < 0.0f ? (floatn)(0.0f) : share * v[q];
                             blocks[q] += share * (alpha < 0.0f ? -alpha : alpha);
                         }
                     }
                 }
-                float16 rest = (float16)(0.0f);
+                floatn rest = (floatn)(0.0f);
 #if MULTIVIEW_VOID
                 if (s == size.layers) {
 #pragma unroll
@@ -862,30 +892,28 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
                     left[q] -= left[q] * blocks[q];
                     rest += left[q];
                 }
-                open = sum16(rest);
+                open = sum_lanes(rest);
             }
         }
         __global float *out = image + (size_t)(y - guard) * (size.width - 2 * guard) * 4;
 #pragma unroll
         for (int q = 0; q < 4; q++) {
-            const float4 p[4] = {sum[q].s0123, sum[q].s4567, sum[q].s89ab, sum[q].scdef};
-#if MULTIVIEW_VOID
-            const float clear[4] = {past[q].s3, past[q].s7, past[q].sb, past[q].sf};
-#endif
-            for (int j = 0; j < 4; j++) {
-                const int x = x0 + (4 * q + j) * MULTIVIEW_STRIDE;
+#pragma unroll
+            for (int j = 0; j < PIXELS; j++) {
+                const float4 p = pixel_of(sum[q], j);
+                const int x = x0 + (PIXELS * q + j) * MULTIVIEW_STRIDE;
                 if (x < guard || x >= end_x) continue;
 #if MULTIVIEW_SPARSE
                 if (row_gaps[x / MULTIVIEW_CELL] != 0) continue;
 #endif
 #if MULTIVIEW_VOID
-                const float past_all = clear[j];
+                const float past_all = pixel_of(past[q], j).w;
 #else
                 const float past_all = 0.0f;
 #endif
 #if MULTIVIEW_PARTS
                 __global float *sums = out + (x - guard) * 4;
-                store_pixel(sums, first ? p[j] : load_pixel(sums) + p[j]);
+                store_pixel(sums, first ? p : load_pixel(sums) + p);
 #if MULTIVIEW_VOID
                 const int width = size.width - 2 * guard, height = size.height - 2 * guard;
                 __global float *gone = image + (size_t)width * height * 4 + (size_t)(y - guard) * width + (x - guard);
@@ -893,7 +921,7 @@ __kernel void multiview_trace(__global float *restrict image, const __global flo
 #endif
 #else
                 const float least = MULTIVIEW_LEAST * (float)rays.y;
-                store_pixel(out + (x - guard) * 4, resolved(p[j], past_all, least, color, size, x, y));
+                store_pixel(out + (x - guard) * 4, resolved(p, past_all, least, color, size, x, y));
 #endif
             }
         }

@@ -339,7 +339,7 @@ class _Builder:
             traffic_bytes=self.slots * 4,
         )
         if self.views.is_shaded:
-            split, made = split_pass(self.shape, self.traits.is_cpu)
+            split, made = split_pass(self.shape, self.traits)
             self.buffers += [*shading_inputs(self.shape), *made]
             self.passes.append(split)
         mips = self._pyramid()

@@ -735,7 +735,7 @@ class _Builder:
 
     def __init__(self, method: Multiview, shape: FrameShape, layers: LensLayers, traits: Traits) -> None:
         self.method, self.shape, self.layers = method, shape, layers
-        self.is_cpu = traits.is_cpu
+        self.traits, self.is_cpu, self.lanes = traits, traits.is_cpu, traits.lanes
         factor = self.factor = method.supersample
         if shape.width % factor or shape.height % factor or shape.guard_px % factor:
             raise InputError(
@@ -788,7 +788,7 @@ class _Builder:
         sets = ray_sets(self.method, self.layers.aperture, max(1, self.layers.eyes))
         self._classify()
         if self.layers.eyes:
-            split, made = split_pass(self.shape, self.is_cpu)
+            split, made = split_pass(self.shape, self.traits)
             self.passes.append(split)
             peels = Buffer("view", self.shape.layers * self.shape.height * self.shape.width * 16)
             self.buffers += [*shading_inputs(self.shape), *made, peels]
@@ -798,7 +798,7 @@ class _Builder:
         self.buffers.append(Buffer("moments", self.layers.total * math.prod(self.fine_cells) * 16))
         for group, ranges in enumerate(sets.ranges):
             if self.layers.eyes:
-                self.passes.append(view_pass(self.shape, self.is_cpu, sets.eyes[group]))
+                self.passes.append(view_pass(self.shape, self.traits, sets.eyes[group]))
             if group == 0 or not self.peeled:
                 self._split(plain)
             if not self.shape.is_opaque:
@@ -818,7 +818,7 @@ class _Builder:
         self._add(
             "multiview_extent",
             (write("extent"), read("inv_depth"), self.fine, self.lens[0]),
-            (shape.pitch // 16, shape.height, shape.layers),
+            (shape.pitch // self.lanes, shape.height, shape.layers),
             2 * self.peel_bytes,
         )
         self._add(
@@ -968,7 +968,7 @@ class _Builder:
                 *((np.int32(group == 0),) if self.layers.eyes else ()),
                 *((read("gaps"),) if self.shape.is_sparse else ()),
             ),
-            (-(-self.width // (16 * self.stride)), height),
+            (-(-self.width // (self.lanes * self.stride)), height),
             height * width * 16 * (int(ranges[-1, 1]) + 1),
         )
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..host.device import Traits
 from ..host.passes import Buffer, Param, Pass, Role, read, write
 from ..lighting import Environment
 from .base import FrameShape
@@ -39,7 +40,7 @@ def shading_inputs(shape: FrameShape) -> list[Buffer]:
     return [Buffer(name, nbytes, Role.INPUT) for name, nbytes in sizes.items()]
 
 
-def split_pass(shape: FrameShape, is_cpu: bool) -> tuple[Pass, list[Buffer]]:
+def split_pass(shape: FrameShape, traits: Traits) -> tuple[Pass, list[Buffer]]:
     """Take what surfaces mirror out of ``color``: the pass, and the buffers ``matte`` and ``surface`` that it makes."""
     slots = shape.layers * shape.height
     buffers = [
@@ -48,10 +49,10 @@ def split_pass(shape: FrameShape, is_cpu: bool) -> tuple[Pass, list[Buffer]]:
     ]
     inputs = [read(name) for name in ("color", "inv_depth", *_READ, environment_of(shape))]
     traffic = sum(buffer.nbytes for buffer in buffers) + slots * shape.width * 48
-    return _pass("shading_split", (write("matte"), write("surface"), *inputs), shape, is_cpu, (), traffic), buffers
+    return _pass("shading_split", (write("matte"), write("surface"), *inputs), shape, traits, (), traffic), buffers
 
 
-def view_pass(shape: FrameShape, is_cpu: bool, eye: NDArray[np.float64]) -> Pass:
+def view_pass(shape: FrameShape, traits: Traits, eye: NDArray[np.float64]) -> Pass:
     """Make the buffer ``view``, the peels' colours as a point of the lens sees them, from what :func:`split_pass` made.
 
     ``eye`` is (right, up) in units of the lens's radius; the radius is the parameter ``aperture_radius_m``.
@@ -59,14 +60,14 @@ def view_pass(shape: FrameShape, is_cpu: bool, eye: NDArray[np.float64]) -> Pass
     inputs = [read(name) for name in ("matte", "surface", "inv_depth", "lighting", environment_of(shape))]
     place = (np.float32(eye[0]), np.float32(eye[1]), Param("aperture_radius_m", np.dtype(np.float32)))
     traffic = shape.layers * shape.height * shape.width * (32 + 4 * PLANES)
-    return _pass("shading_view", (write("view"), *inputs), shape, is_cpu, place, traffic)
+    return _pass("shading_view", (write("view"), *inputs), shape, traits, place, traffic)
 
 
 def _pass(
-    kernel: str, buffers: tuple[Any, ...], shape: FrameShape, is_cpu: bool, rest: tuple[Any, ...], traffic: int
+    kernel: str, buffers: tuple[Any, ...], shape: FrameShape, traits: Traits, rest: tuple[Any, ...], traffic: int
 ) -> Pass:
     sizes = (np.int32(n) for n in (shape.layers, shape.height, shape.width, shape.pitch))
-    extent = (shape.pitch // 16, shape.height, shape.layers)
-    local_size = (1, 1, 1) if is_cpu else None  # every new local size costs PoCL a compilation
+    extent = (shape.pitch // traits.lanes, shape.height, shape.layers)
+    local_size = (1, 1, 1) if traits.is_cpu else None  # every new local size costs PoCL a compilation
     defines = shading_defines(shape)
     return Pass("shading", kernel, (*buffers, *sizes, *rest), extent, local_size, defines, traffic_bytes=traffic)

@@ -21,7 +21,7 @@ AROUND = replace(LIGHTS, environment=environment())
 
 def matte_of(device: Device, frame: LayeredFrame, output: str = "matte") -> np.ndarray:
     shape = FrameShape.of(frame)
-    one, made = split_pass(shape, device.traits.is_cpu)
+    one, made = split_pass(shape, device.traits)
     buffers = [Buffer(name, frame.inputs[name].nbytes, Role.INPUT) for name in frame.inputs if name != "albedo"]
     buffers += [Buffer("color", frame.color.nbytes, Role.INPUT)]
     buffers += [Buffer("inv_depth", shape.layers * shape.height * shape.pitch * 4, Role.INPUT)]
