@@ -103,6 +103,7 @@ use_system_pocl() {
     local icd=/etc/OpenCL/vendors/pocl.icd
     [ -e "$icd" ] || apt_install pocl-opencl-icd || return 1
     OCL_ICD_VENDORS=$icd have_cl || return 1
+    say "the system's PoCL works here, and pip's does not or is not there: $venv is left to the system's"
     drop_pip_pocl
     touch "$system_pocl_stamp"
     have_cl

@@ -42,8 +42,8 @@ def prepare_drivers() -> None:
 
     On Windows pip does not register a driver, and the Khronos loader in pyopencl's wheel looks at the registry and at
     ``OCL_ICD_FILENAMES`` (which it ignores in processes with administrator rights). Intel's runtime generates code for
-    SSE on processors that Intel did not make, unless it is told which extensions there are: layered at 1024x1024 takes
-    116 ms on an AMD Zen 4, with AVX2 84. What the user has set stays.
+    SSE on processors that Intel did not make, unless it is told which extensions there are (docs/decisions.md). What
+    the user has set stays.
     """
     if sys.platform == "win32" and (library := _intel_library()):
         os.environ.setdefault("OCL_ICD_FILENAMES", str(library))
