@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from configparser import ConfigParser
@@ -38,7 +39,7 @@ def test_python_m_cldof_is_cldof(tmp_path: Path) -> None:
         done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
         return done.returncode, done.stdout, done.stderr
 
-    environment = {"PYTHONPATH": str(ROOT), "HOME": str(tmp_path)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     assert says("--version") == (0, f"cldof {cldof.__version__}\n", "")
     code, out, err = says("render", "no such scene", "-o", "out.png")
     assert (code, out) == (2, "") and err.startswith("cldof: ")  # its exit code is main's
