@@ -7,7 +7,7 @@ ARGS ?=
 
 export PYTHON
 
-.PHONY: help demo test test-install test-devices test-cpus gpu-check test-oclgrind stability mutants bench lint clean
+.PHONY: help demo test test-install test-devices test-cpus gpu-check gpu-registers test-oclgrind stability mutants bench lint clean
 
 help:
 	@echo "make demo   render a built-in scene to out/demo.png (and out/demo-pinhole.png beside it)"
@@ -17,6 +17,7 @@ help:
 	@echo "make test-devices   the kernel and method tests on every OpenCL driver that can be installed, and how they agree"
 	@echo "make test-cpus      every kernel as other x86-64 processors and Debian's PoCL have it (under 15 minutes)"
 	@echo "make gpu-check      a GPU in eight minutes: pictures, speed, kernel tests, one JSON (DEVICE= picks)"
+	@echo "make gpu-registers  what NVIDIA's assembler makes of the kernels: registers, stack, spills, occupancy; needs no GPU"
 	@echo "make test-oclgrind  every kernel under a simulator that checks each access to memory (minutes)"
 	@echo "make mutants        faults put into the kernels: how many the tests notice (an hour)"
 	@echo "make bench  speed of each pass, then accuracy and time of every method, quickly (4 minutes)"
@@ -57,6 +58,10 @@ test-cpus:
 gpu-check:
 	@scripts/setup.sh test
 	@scripts/gpu_check.sh $(if $(DEVICE),"$(DEVICE)") $(ARGS)
+
+gpu-registers:
+	@scripts/setup.sh registers
+	$(VENV)/python -m tests.tools.registers $(ARGS)
 
 test-oclgrind:
 	@scripts/setup.sh test

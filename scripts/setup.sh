@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Make .venv ready, from nothing: setup.sh core|test|dev|bench|oclgrind|rusticl
+# Make .venv ready, from nothing: setup.sh core|test|dev|bench|oclgrind|rusticl|registers
 #
 # Installs what is missing and no more; a second run is instant. Uses apt-get (with sudo when not root) for what pip
 # cannot bring: Python's own venv module, what PoCL links its kernels with, a PoCL where pip has none that works here, an
@@ -82,6 +82,10 @@ drop_pip_pocl() { "$venv/bin/python" -m pip uninstall -qq -y --disable-pip-versi
 # An existing .venv whose interpreter is gone (an upgrade of the system, a moved folder) is made anew.
 "$venv/bin/python" -c 'import pip' 2>/dev/null || make_venv
 
+# What `registers` needs of Python is what `test` needs.
+tools=
+if [ "$extra" = registers ]; then extra=test stamp=$venv/.cldof-test tools=registers; fi
+
 if [ ! -e "$stamp" ] || [ setup.cfg -nt "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
     target=.
     [ "$extra" = core ] || target=".[$extra]"
@@ -136,4 +140,13 @@ if [ "$extra" = test ] && [ ! -e "$clang_stamp" ]; then
     have_clang || { apt_install clang && have_clang; } ||
         say "no clang that knows OpenCL C: kernels are not checked for other processors; install clang."
     touch "$clang_stamp" # asked once; tests find a clang that comes later by themselves
+fi
+
+# NVIDIA's assembler, from CUDA or from PyPI, and the builtins that go with clang's version.
+if [ -n "$tools" ]; then
+    command -v ptxas >/dev/null || [ -x /usr/local/cuda/bin/ptxas ] ||
+        "$venv/bin/python" -m pip install -qq --disable-pip-version-check nvidia-cuda-nvcc-cu12 ||
+        say "nvidia-cuda-nvcc-cu12, which has ptxas, cannot be installed"
+    missing=$("$venv/bin/python" -c 'from tests.tools.registers import missing_package; print(missing_package())')
+    [ -z "$missing" ] || apt_install "$missing" || say "$missing cannot be installed"
 fi

@@ -21,6 +21,7 @@ import cldof.kernels
 from cldof import Camera, LayeredFrame, Lens, Renderer
 from cldof.host import opencl as cl
 from cldof.host.device import Device, Traits
+from cldof.host.passes import Pass
 from cldof.host.program import BUILD_OPTIONS, Defines, SourceDirectory, expand
 from cldof.methods import FrameShape, gaussian, make_method
 from cldof.planner import BINS, MAX_CHANGE, SceneStats, bin_scale, everything, plan_frame, planned_program
@@ -72,10 +73,10 @@ class Case:
         frame = FRAMES[self.frame]()
         return renderer.render(frame, Lens(self.coc_px / frame.camera.focal_px, 2.0)).image
 
-    def programs(self, traits: Traits) -> set[Program]:
-        """Those that a device with such traits builds for it; without a device."""
+    def passes(self, traits: Traits) -> list[Pass]:
+        """Those that a device with such traits gets for it; without a device. ``blur`` has none: no method calls it."""
         if self.method == "blur":
-            return {("blur", ())}
+            return []
         frame = _frame(self.frame)
         shape = FrameShape.of(frame)
         lens = Lens(self.coc_px / frame.camera.focal_px, 2.0)
@@ -86,12 +87,17 @@ class Case:
             plan = plan_frame(method, frame, lens, _stats_of(self.frame), traits, MAX_CHANGE)
         else:
             plan = everything(method, frame, lens)
-        passes = list(_preparation_program(shape, traits.is_cpu, is_planned).passes)
         program = planned_program(method, shape, plan, traits)
         left = factor // getattr(method, "supersample", 1)
         if left > 1:
             program = _resolved(program, _Resolve(left, _image_size(shape, factor), antialias))
-        return {(one.source, tuple(one.defines)) for one in (*passes, *program.passes)}
+        return [*_preparation_program(shape, traits.is_cpu, is_planned).passes, *program.passes]
+
+    def programs(self, traits: Traits) -> set[Program]:
+        """Those that a device with such traits builds for it; without a device."""
+        if self.method == "blur":
+            return {("blur", ())}
+        return {(one.source, tuple(one.defines)) for one in self.passes(traits)}
 
 
 def _blurred(device: Device) -> np.ndarray:

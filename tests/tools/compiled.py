@@ -29,7 +29,7 @@ from pathlib import Path
 from cldof.host.device import Traits
 from cldof.host.lanes import GPU_LANES, LANES
 from cldof.host.program import Defines, SourceDirectory, expand
-from tests.every_kernel import CASES
+from tests.every_kernel import CASES, Program
 
 __all__ = [
     "TARGETS",
@@ -38,6 +38,7 @@ __all__ = [
     "Target",
     "all_traits",
     "cpu_traits",
+    "expanded",
     "failures",
     "find_clang",
     "gpu_traits",
@@ -142,16 +143,23 @@ def sources(traits: Iterable[Traits], directory: SourceDirectory | None = None) 
     dict
         Text by name; the name is of the file and its compile-time constants.
     """
-    directory = directory or files("cldof.kernels")
     found: dict[str, str] = {}
     for device in traits:
-        for stem, defines in sorted(set().union(*(case.programs(device) for case in CASES)), key=str):
-            # As Device has it: for all programs, unless one has its own.
-            widths: Defines = () if any(name == "LANES" for name, _ in defines) else (("LANES", device.lanes),)
-            text = expand(stem, (*widths, *defines), directory)
-            words = (f"{name}={value}" for name, value in (*widths, *defines))
-            found.setdefault(text, f"{stem}.cl {' '.join(words)}".strip())
+        for program in sorted(set().union(*(case.programs(device) for case in CASES)), key=str):
+            name, text = expanded(program, device, directory)
+            found.setdefault(text, name)
     return {name: text for text, name in found.items()}
+
+
+def expanded(program: Program, traits: Traits, directory: SourceDirectory | None = None) -> tuple[str, str]:
+    """Name and text of one program on a device with such traits, as :func:`sources` has them."""
+    stem, defines = program
+    # As Device has it: for all programs, unless one has its own.
+    widths: Defines = () if any(name == "LANES" for name, _ in defines) else (("LANES", traits.lanes),)
+    words = (f"{name}={value}" for name, value in (*widths, *defines))
+    return f"{stem}.cl {' '.join(words)}".strip(), expand(
+        stem, (*widths, *defines), directory or files("cldof.kernels")
+    )
 
 
 _VECTOR = re.compile(r"<(\d+) x (i\d+|half|bfloat|float|double|ptr)>")
@@ -233,14 +241,14 @@ def all_traits(lanes: Sequence[int] = LANES) -> list[Traits]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code: 1 when a program failed, 2 without a clang."""
+    """The command; returns its exit code: 1 when a program failed."""
     parser = argparse.ArgumentParser(prog="tests.tools.compiled", description=__doc__.split("\n\n")[0])
     parser.add_argument("--optimisation", type=int, default=2, help="level of the objects (2)")
     parser.add_argument("--kernels", type=Path, help="kernel files other than the library's")
     options = parser.parse_args(arguments)
     if not (clang := find_clang()):
-        print("no clang that knows OpenCL C is here (Debian and Ubuntu: apt-get install clang)", file=sys.stderr)
-        return 2
+        print("SKIPPED: no clang that knows OpenCL C (Debian and Ubuntu: apt-get install clang)", file=sys.stderr)
+        return 0
     has_failed = False
     for target, level in ((X86_64_V4, None), *((target, options.optimisation) for target in TARGETS)):
         started = time.perf_counter()
