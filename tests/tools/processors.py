@@ -32,6 +32,7 @@ from cldof.errors import BuildError
 from cldof.host import opencl as cl
 from cldof.host.lanes import LANES
 from cldof.host.program import BUILD_OPTIONS
+from cldof.host.trial import SWITCH
 from tests.every_kernel import CASES
 from tests.tools import feigned
 from tests.tools.compiled import cpu_traits, sources
@@ -277,7 +278,8 @@ def _outcome(leg: Leg, forms: Sequence[int], folder: Path) -> Outcome:
 
 
 def _part(leg: Leg, items: Sequence[int], folder: Path) -> Outcome:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    # This is the process that may end; the library needs no other to try things in.
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), SWITCH: "0"}
     if leg.feigned:
         environment = feigned.environment(leg.feigned, folder, environment)
     else:
