@@ -17,6 +17,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -60,10 +61,18 @@ class Rendered:
 
 
 def chosen(pattern: str = "", every: bool = False) -> list[Case]:
-    """The forms that have the pattern in their name: all, or those that render a whole frame."""
+    """The forms that have the pattern in their name: all, or those that render a whole frame.
+
+    Methods take turns, so that a device whose time is up has shown something of each.
+    """
     frames = ("opaque", "void", "shaded")
-    whole = [case for case in CASES if every or (case.frame in frames and case.method != "blur")]
-    return [case for case in whole if re.search(pattern, case.name)]
+    turns: Counter[str] = Counter()
+    found = []
+    for case in CASES:
+        if (every or (case.frame in frames and case.method != "blur")) and re.search(pattern, case.name):
+            found.append((turns[case.method], case))
+            turns[case.method] += 1
+    return [case for _, case in sorted(found, key=lambda one: one[0])]
 
 
 def psnr_db(a: np.ndarray, b: np.ndarray) -> float:

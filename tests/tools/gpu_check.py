@@ -193,7 +193,7 @@ def judged_forms(facts: dict[str, Any], log: str) -> Part:
 
 
 _OUTCOME = re.compile(r"^(tests/\S+?::.*?) (PASSED|FAILED|ERROR|SKIPPED|XFAIL|XPASS)\b", re.MULTILINE)
-_COLLECTED = re.compile(r"^collected (\d+) items(?: / (\d+) deselected)?", re.MULTILINE)
+_COLLECTED = re.compile(r"\bcollected (\d+) items(?: / (\d+) deselected)?")
 
 
 def test_counts(text: str) -> dict[str, Any]:

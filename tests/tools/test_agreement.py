@@ -78,8 +78,12 @@ def test_forms_come_from_processes_of_their_own(
     assert cut.cut and not cut.images and not cut.died
 
 
-def test_every_form_is_more_than_whole_frames() -> None:
-    assert agreement.chosen(every=True) == CASES
+def test_methods_take_turns_and_every_form_is_more_than_whole_frames() -> None:
+    every = agreement.chosen(every=True)
+    assert {case.name for case in every} == {case.name for case in CASES}
+    assert len(every) == len(CASES)
+    methods = {case.method for case in CASES}
+    assert {case.method for case in every[: len(methods)]} == methods
     assert 0 < len(agreement.chosen()) < len(CASES)
 
 

@@ -53,7 +53,7 @@ def pytest_text(*outcomes: str, collected: int = 9) -> str:
     lines = [
         f"tests/kernels/test_a.py::test_x[opaque 5px - {n}] {outcome}  [ 10%]" for n, outcome in enumerate(outcomes)
     ]
-    return "\n".join([f"collected {collected} items / 2 deselected / 7 selected", *lines, ""])
+    return "\n".join([f"collecting ... collected {collected} items / 2 deselected / 7 selected", *lines, ""])
 
 
 def test_tests_are_counted_however_they_end() -> None:
