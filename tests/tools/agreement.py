@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from cldof.host.trial import SWITCH
 from tests.every_kernel import CASES, Case
 from tests.limits import VARIABLE
 
@@ -163,7 +164,8 @@ def _rendered(part: str, limit: str, cases: Sequence[Case], options: argparse.Na
     folder = Path(tempfile.mkdtemp(dir=folder))
     command = [sys.executable, "-m", "tests.limits", "tests.tools.agreement", "--only", options.only]
     command += [*(["--every"] if options.every else []), "--store", part, str(folder)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), VARIABLE: limit}
+    # It may die, so that what it builds needs no child to be tried in.
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), VARIABLE: limit, SWITCH: "0"}
     made = Rendered()
     try:
         done = subprocess.run(
