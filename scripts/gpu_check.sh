@@ -25,7 +25,7 @@
 #   seconds           all of it
 #   parts             by name: state ("passed", "failed", "cut": its time was up and what ran passed, "skipped"),
 #                     why, seconds, budget_s, log (the last lines, where it did not pass), and
-#     doctor          report: what doctor printed
+#     doctor          findings (what, state, found, advice), methods of this device (db or error, seconds)
 #     forms           forms, compared, same_bits, least_db, worst, below_70_db, db (by form; "inf": the same bits),
 #                     devices: of "CPU" and "device" rendered, cut, died, errors, lacking (what it has not, by form)
 #     speed           rows, not_timed: as `bench speed --output` writes them; of a row: title, method, options, width,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 import time
@@ -14,7 +15,7 @@ import pytest
 from cldof.errors import DeviceError
 from cldof.host.device import DeviceInfo
 from tests.tools import gpu_check
-from tests.tools.gpu_check import Check, Part, Run, choose, judged_forms, judged_tests, run_process, slug
+from tests.tools.gpu_check import Check, Part, Run, choose, judged_doctor, judged_forms, judged_tests, run_process, slug
 
 CPU = DeviceInfo(0, "pthread-cpu", "Portable Computing Language", "3.0", "cpu", 2, 1 << 30)
 GPU = DeviceInfo(1, "NVIDIA H200 (PCIe)", "NVIDIA CUDA", "550", "gpu", 132, 1 << 37)
@@ -81,6 +82,26 @@ def test_tests_are_judged(code: int | None, outcomes: list[str], state: str, why
     part = judged_tests(Run(code, 1.0, pytest_text(*outcomes)))
     assert part.state == state
     assert why in part.why
+
+
+@pytest.mark.parametrize(("state", "expected"), [("ok", "passed"), ("note", "failed"), ("bad", "failed")])
+def test_doctor_is_asked_about_this_device(state: str, expected: str) -> None:
+    """Whatever it says of others; with no source in what is kept."""
+    methods = {"layered": {"db": math.inf}, "pyramid": {"error": f"a kernel did not compile\n--- source\n{'x' * 9000}"}}
+    report = {
+        "findings": [
+            {"what": "Python", "state": "ok", "found": "3.11", "advice": ""},
+            {"what": "device 0", "state": "bad" if state == "ok" else "ok", "found": "another", "advice": ""},
+            {"what": "device 1", "state": state, "found": "pyramid: wrong", "advice": "x"},
+        ],
+        "devices": [{"index": 0, "methods": {}}, {"index": 1, "methods": methods}],
+    }
+    part = judged_doctor(report, 1)
+    assert part.state == expected
+    assert part.why == ("" if state == "ok" else "pyramid: wrong")
+    assert part.facts["methods"] == {"layered": {"db": "inf"}, "pyramid": {"error": "a kernel did not compile"}}
+    assert [finding["what"] for finding in part.facts["findings"]] == ["Python"]
+    assert judged_doctor(report, 2).state == "failed"
 
 
 def forms_facts(db: dict[str, Any], **device: Any) -> dict[str, Any]:
