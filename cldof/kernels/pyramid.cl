@@ -239,24 +239,27 @@ __kernel void pyramid_flatten(__global float *restrict flat, __global float *res
  * writes  slope     float[sources][height][pitch]  1/m per px; 0 where no neighbour is known; anything in holes
  *         broad     float[height][pitch]  share of a blur's weight around a pixel that belongs to the surface of source
  *                   0 or hides it; 1 in front of the first sub-image and behind the last
- *         span      float[sources][height][pitch / PYRAMID_BLOCK][2]  1/m; of each block the nearest slot, EMPTY if all
- *                   are holes, and the farthest, or EMPTY minus it if there are holes
+ *         span      float4[sources][height][pitch / PYRAMID_BLOCK]  of each block the nearest slot, EMPTY if all are
+ *                   holes, and the farthest, or EMPTY minus it if there are holes, 1/m; the greatest slope; the least
+ *                   of `broad`
  * range   2-D: (items per row, sources * height), any local size; an item takes every get_global_size(0)-th block */
 __kernel void pyramid_slope(__global float *restrict slope, __global float *restrict broad,
-                            __global float *restrict span, const __global float *restrict flat_inv,
+                            __global float4 *restrict span, const __global float *restrict flat_inv,
                             const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
     const int row = get_global_id(1), y = row % size.height;
     const int width = size.width, height = size.height, pitch = size.pitch;
     for (int x0 = PYRAMID_BLOCK * get_global_id(0); x0 < pitch; x0 += PYRAMID_BLOCK * get_global_size(0)) {
-        floatn nearest = (floatn)(EMPTY), farthest = (floatn)(MAXFLOAT);
+        floatn nearest = (floatn)(EMPTY), farthest = (floatn)(MAXFLOAT), steepest = (floatn)(0.0f);
+        floatn narrowest = (floatn)(1.0f);
         intn holes = (intn)(0);
         for (int x = x0; x < x0 + PYRAMID_BLOCK; x += LANES) {
             const size_t at = (size_t)row * pitch + x;
-            const floatn w = load_lanes(flat_inv + at);
-            store_lanes(slope + at, slope_of(flat_inv + at, w, x, y, height, pitch, MAXFLOAT));
+            const floatn w = load_lanes(flat_inv + at), step = slope_of(flat_inv + at, w, x, y, height, pitch, MAXFLOAT);
+            store_lanes(slope + at, step);
             nearest = greater(nearest, w);
             farthest = w < 0.0f ? farthest : lesser(farthest, w);
+            steepest = w < 0.0f ? steepest : greater(steepest, step);
             holes |= w < 0.0f;
             if (row >= height) continue;
             floatn share = (floatn)(1.0f);
@@ -272,11 +275,13 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
                 near = 1.0f - PYRAMID_NEAR_RING * (1.0f - near) - PYRAMID_FAR_RING * (1.0f - far);
                 share = is_own ? near : share;
             }
-            store_lanes(broad + (size_t)row * pitch + x, share);
+            store_lanes(broad + at, share);
+            narrowest = lesser(narrowest, share);
         }
-        __global float *to = span + ((size_t)row * pitch + x0) / PYRAMID_BLOCK * 2;
-        to[0] = greatest_lane(nearest);
-        to[1] = any_lane(holes) ? EMPTY - least_lane(farthest) : least_lane(farthest);
+        const float last = least_lane(farthest);
+        span[((size_t)row * pitch + x0) / PYRAMID_BLOCK] =
+            (float4)(greatest_lane(nearest), any_lane(holes) ? EMPTY - last : last, greatest_lane(steepest),
+                     least_lane(narrowest));
     }
 }
 
@@ -330,12 +335,6 @@ INLINE floatn matting_fall(floatn w, float4 ramp) { return clamp01(matting_axis(
 
 /* --- culling (section 3.1) --- */
 
-/* Nearest and farthest slot of a block tell of most that a sub-image culls all of it, or none, or has no use for it. */
-INLINE const __global float *span_of(const __global float *span, PyramidSize size, int s, int x, int y)
-{
-    return span + (((size_t)s * size.height + y) * size.pitch + x) / PYRAMID_BLOCK * 2;
-}
-
 /* What is known of a block in a sub-image. */
 typedef struct {
     int first; /* the first source of which the sub-image does not cull all slots; size.sources if there is none */
@@ -343,28 +342,32 @@ typedef struct {
 } PyramidBlock;
 
 #define BLOCK_MIXED 0
-/* All of `first` is past the front ramp: no pixel is culled, or shows anything behind it. */
+/* All of `first` is past the front ramp, without holes: no pixel is culled or shows what is behind it. */
 #define BLOCK_PAST 1
 /* The same, and all of it is too far behind the sub-image to be in it. */
 #define BLOCK_BEHIND 2
 
-/* The block of frame pixel (x, y), which may lie outside. */
-INLINE PyramidBlock block_of(const __global float *span, PyramidSize size, PyramidRamps ramps, int x, int y)
+/* The block of frame pixel (x, y), which may lie outside. What `span` holds tells of most that none of it counts, or all. */
+INLINE PyramidBlock block_of(const __global float4 *span, PyramidSize size, PyramidRamps ramps, int x, int y)
 {
     PyramidBlock block = {size.sources, BLOCK_MIXED};
     if (x < 0 || x >= size.pitch || y < 0 || y >= size.height) return block;
 #if PYRAMID_PAPER
     block.first = 0;
 #else
-    const __global float *of = span_of(span, size, 0, x, y);
-    for (int s = 0; s < size.sources; s++, of += (size_t)size.height * size.pitch / PYRAMID_BLOCK * 2) {
-        const float nearest = of[0], farthest = of[1] < 0.0f ? EMPTY - of[1] : of[1];
-        if (nearest < 0.0f || farthest * ramps.ramp.x + ramps.ramp.y <= 0.0f) continue;
+    span += ((size_t)y * size.pitch + x) / PYRAMID_BLOCK;
+    for (int s = 0; s < size.sources; s++, span += (size_t)size.height * size.pitch / PYRAMID_BLOCK) {
+        const float4 of = *span;
+        const int has_holes = of.y < 0.0f;
+        const float nearest = of.x, farthest = has_holes ? EMPTY - of.y : of.y;
+        /* How much of the front ramp the steepest surface needs, and a rounding. */
+        const float early = of.z > -1.0f / ramps.ramp.x ? 1.0f : clamp(1.0001f * of.z * ramps.seam, 1.0001e-3f, 1.0f);
+        if (nearest < 0.0f || farthest * ramps.ramp.x + ramps.ramp.y <= 1.0f - early) continue;
         block.first = s;
-        if (of[1] < 0.0f) break; /* holes */
+        if (has_holes) break;
         if (nearest * ramps.ramp.z + ramps.ramp.w <= 0.0f) block.kind = BLOCK_BEHIND;
         else if (nearest * ramps.ramp.x + ramps.ramp.y >= 1.0f &&
-                 (s > 0 || nearest * ramps.before.x + ramps.before.y <= 0.0f)) block.kind = BLOCK_PAST;
+                 (s > 0 || nearest * ramps.before.x + ramps.before.y <= 0.0f || of.w >= 1.0f)) block.kind = BLOCK_PAST;
         break;
     }
 #endif
@@ -464,7 +467,7 @@ INLINE void pull_whole(__global float *color, __global float *inv, const __globa
 __kernel void pyramid_cull(__global float *restrict fill, __global float *restrict fill_inv,
                            const __global float *restrict flat, const __global float *restrict flat_inv,
                            const __global float *restrict slope, const __global float *restrict broad,
-                           const __global float *restrict span, const __global int4 *restrict table,
+                           const __global float4 *restrict span, const __global int4 *restrict table,
                            const __global PyramidMatting *restrict matting, PyramidSize size)
 {
     const int i = get_global_id(1);
@@ -691,6 +694,7 @@ INLINE int add_matted(floatn quad[4], const __global float *flat, const __global
             const floatp weights[4] = FOUR_PARTS(r);
 #pragma unroll
             for (int q = 0; q < 4; q++) quad[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread(weights[q]);
+            if (!any_lane(lets > 0.0f)) break;
         }
     }
 #endif
@@ -737,7 +741,7 @@ INLINE float4 load_pixel_local(const __local float *p) { return *(const __local 
  * local   lines  float[2][2 * segment + 32][4]  sums of two rows of level 0, from 16 px before the segment on */
 __kernel void pyramid_matte(__global float *restrict blur, const __global float *restrict flat,
                             const __global float *restrict flat_inv, const __global float *restrict slope,
-                            const __global float *restrict broad, const __global float *restrict span,
+                            const __global float *restrict broad, const __global float4 *restrict span,
                             const __global float *restrict fill,
                             const __global float *restrict fill_inv, const __global int4 *restrict table,
                             const __global PyramidMatting *restrict matting, PyramidSize size, int segment,
@@ -891,7 +895,7 @@ INLINE void store_finished(__global float *out, floatn v, PyramidSize size, int 
 __kernel void pyramid_blend(__global float *restrict out, const __global float *restrict blur,
                             const __global float *restrict flat, const __global float *restrict flat_inv,
                             const __global float *restrict slope, const __global float *restrict broad,
-                            const __global float *restrict span, const __global float *restrict fill,
+                            const __global float4 *restrict span, const __global float *restrict fill,
                             const __global float *restrict fill_inv,
                             const __global int4 *restrict table,
                             const __global PyramidMatting *restrict matting, PyramidSize size, int count)

@@ -453,7 +453,7 @@ class _Builder:
         for name, nbytes in (
             (flat, stack * 16),
             (inv, stack * 4),
-            *(((slope, stack * 4), (broad, self.frame_pixels * 4), (span, stack // 2)) if slope != inv else ()),
+            *(((slope, stack * 4), (broad, self.frame_pixels * 4), (span, stack)) if slope != inv else ()),
             (fill, self.level_pixels * 16),
             (fill_inv, self.level_pixels * 4),
             (blur, self.level_pixels * 16 if steps else 16),
