@@ -34,6 +34,7 @@
 #ifndef PYRAMID_RUN
 #define PYRAMID_RUN PYRAMID_BLOCK
 #endif
+#define PYRAMID_RUNS (PYRAMID_RUN / LANES)
 /* Below this coverage the result is 0 rather than a quotient of rounding errors. */
 #define PYRAMID_MIN_COVERAGE 1e-4f
 
@@ -645,22 +646,12 @@ __kernel void pyramid_push(__global float *restrict fill, __global float *restri
     }
 }
 
-/* Adds LANES pixels of a sub-image's level 0, culled, disoccluded and weighted, to `quad`. Returns 0 if nothing is
- * there. */
-INLINE int add_matted(floatn quad[4], const __global float *flat, const __global float *flat_inv,
+/* Adds LANES pixels of a sub-image's level 0, culled, disoccluded and weighted, to `quad`. */
+INLINE void add_mixed(floatn quad[4], const __global float *flat, const __global float *flat_inv,
                       const __global float *slope, const __global float *broad, const __global float *fill,
                       const __global float *fill_inv, int4 sub, int4 level, PyramidSize size, PyramidRamps ramps, int x,
                       int y, PyramidBlock block)
 {
-    if (block.kind == BLOCK_BEHIND) return 0;
-    if (block.kind == BLOCK_PAST) {
-        const size_t at = ((size_t)block.first * size.height + y) * size.pitch + x;
-        const floatn weight = matting_fall(load_lanes(flat_inv + at), ramps.ramp);
-        const floatp weights[4] = FOUR_PARTS(weight);
-#pragma unroll
-        for (int q = 0; q < 4; q++) quad[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread(weights[q]);
-        return 1;
-    }
     floatn from, w;
     int only;
     floatn weight = cull(&from, &only, &w, flat_inv, slope, broad, size, ramps, x, y, block);
@@ -674,16 +665,14 @@ INLINE int add_matted(floatn quad[4], const __global float *flat, const __global
         filled = matting_rise(v, 0, 0, ramps) * matting_fall(v, ramps.ramp);
         filled = w < 0.0f ? filled : (floatn)(0.0f);
     }
-    const int has_pixels = any_lane(weight > 0.0f), has_holes = any_lane(filled > 0.0f);
-    const int lets_through = any_lane(lets > 0.0f);
-    if (has_pixels) {
+    if (any_lane(weight > 0.0f)) {
         const floatp sources[4] = FOUR_PARTS(from), weights[4] = FOUR_PARTS(weight);
 #pragma unroll
         for (int q = 0; q < 4; q++)
             quad[q] += source_pixels(flat, size, sources[q], only, x + PIXELS * q, y) * spread(weights[q]);
     }
 #if !PYRAMID_PAPER
-    if (lets_through) {
+    if (any_lane(lets > 0.0f)) {
         for (int s = 1; s < size.sources; s++) {
             const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
             floatn ws = load_lanes(flat_inv + at);
@@ -698,7 +687,7 @@ INLINE int add_matted(floatn quad[4], const __global float *flat, const __global
         }
     }
 #endif
-    if (has_holes) {
+    if (any_lane(filled > 0.0f)) {
         const floatp weights[4] = FOUR_PARTS(filled);
 #pragma unroll
         for (int h = 0; h < 2; h++) {
@@ -708,7 +697,30 @@ INLINE int add_matted(floatn quad[4], const __global float *flat, const __global
             quad[2 * h + 1] += c[1] * spread(weights[2 * h + 1]);
         }
     }
-    return has_pixels || has_holes || lets_through;
+}
+
+/* The same for PYRAMID_RUN pixels. */
+INLINE void add_matted(floatn sum[4 * PYRAMID_RUNS], const __global float *flat, const __global float *flat_inv,
+                       const __global float *slope, const __global float *broad, const __global float *fill,
+                       const __global float *fill_inv, int4 sub, int4 level, PyramidSize size, PyramidRamps ramps,
+                       int x, int y, PyramidBlock block)
+{
+    if (block.kind == BLOCK_BEHIND) return;
+    if (block.kind == BLOCK_PAST) {
+        const size_t at = ((size_t)block.first * size.height + y) * size.pitch + x;
+#pragma unroll
+        for (int j = 0; j < PYRAMID_RUNS; j++) {
+            const floatn weight = matting_fall(load_lanes(flat_inv + at + LANES * j), ramps.ramp);
+            const floatp weights[4] = FOUR_PARTS(weight);
+#pragma unroll
+            for (int q = 0; q < 4; q++)
+                sum[4 * j + q] += load_lanes(flat + (at + LANES * j + PIXELS * q) * 4) * spread(weights[q]);
+        }
+        return;
+    }
+    for (int j = 0; j < PYRAMID_RUNS; j++)
+        add_mixed(sum + 4 * j, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x + LANES * j, y,
+                  block);
 }
 
 /* --- blurring (section 3.4): 4x4 box analysis, quadratic B-spline synthesis --- */
@@ -769,14 +781,14 @@ __kernel void pyramid_matte(__global float *restrict blur, const __global float 
                 const int x = first + at - sub.x;
                 const PyramidBlock upper = block_of(span, size, ramps, x, upper_y);
                 const PyramidBlock lower = block_of(span, size, ramps, x, lower_y);
-                for (int j = 0; j < PYRAMID_RUN; j += LANES) {
-                    floatn sum[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
-                    for (int r = 0; r < 2; r++)
-                        add_matted(sum, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x + j,
-                                   r ? lower_y : upper_y, r ? lower : upper);
+                floatn sum[4 * PYRAMID_RUNS];
 #pragma unroll
-                    for (int q = 0; q < 4; q++) store_lanes_local(line + (at + j + PIXELS * q) * 4, sum[q]);
-                }
+                for (int q = 0; q < 4 * PYRAMID_RUNS; q++) sum[q] = (floatn)(0.0f);
+                for (int r = 0; r < 2; r++)
+                    add_matted(sum, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x,
+                               r ? lower_y : upper_y, r ? lower : upper);
+#pragma unroll
+                for (int q = 0; q < 4 * PYRAMID_RUNS; q++) store_lanes_local(line + (at + PIXELS * q) * 4, sum[q]);
             }
         }
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -901,27 +913,37 @@ __kernel void pyramid_blend(__global float *restrict out, const __global float *
                             const __global PyramidMatting *restrict matting, PyramidSize size, int count)
 {
     const int y = size.guard + (int)get_global_id(1);
-    for (int x = size.guard / LANES * LANES + LANES * (int)get_global_id(0); x < size.width - size.guard;
-         x += LANES * (int)get_global_size(0)) {
-        floatn sum[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
+    for (int x = size.guard / PYRAMID_RUN * PYRAMID_RUN + PYRAMID_RUN * (int)get_global_id(0);
+         x < size.width - size.guard; x += PYRAMID_RUN * (int)get_global_size(0)) {
+        floatn sum[4 * PYRAMID_RUNS];
+#pragma unroll
+        for (int q = 0; q < 4 * PYRAMID_RUNS; q++) sum[q] = (floatn)(0.0f);
         for (int i = 0; i < count; i++) {
             const int4 sub = table[i * PYRAMID_LEVELS], level = table[i * PYRAMID_LEVELS + 1];
-            floatn quad[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
+            floatn part[4 * PYRAMID_RUNS];
             if (sub.y == 0) {
                 const PyramidRamps ramps = ramps_of(matting, i);
-                if (!add_matted(quad, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x, y,
-                                block_of(span, size, ramps, x, y))) continue;
+                const PyramidBlock block = block_of(span, size, ramps, x, y);
+                if (block.kind == BLOCK_BEHIND) continue;
+#pragma unroll
+                for (int q = 0; q < 4 * PYRAMID_RUNS; q++) part[q] = (floatn)(0.0f);
+                add_matted(part, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x, y, block);
             } else {
                 const Between rows = between(level, y + sub.x);
-                expand_pixels(quad, blur, rows, (x + sub.x) / 2);
-                expand_pixels(quad + 2, blur, rows, (x + sub.x) / 2 + PIXELS);
-            }
 #pragma unroll
-            for (int q = 0; q < 4; q++) sum[q] = over(sum[q], quad[q]);
-            if (least_lane(CHANNEL_OF(sum, ALPHA)) >= 1.0f) break;
+                for (int j = 0; j < 2 * PYRAMID_RUNS; j++)
+                    expand_pixels(part + 2 * j, blur, rows, (x + sub.x) / 2 + PIXELS * j);
+            }
+            floatn covered = (floatn)(1.0f);
+#pragma unroll
+            for (int q = 0; q < 4 * PYRAMID_RUNS; q++) {
+                sum[q] = over(sum[q], part[q]);
+                covered = lesser(covered, sum[q]);
+            }
+            if (least_pixel(covered).w >= 1.0f) break;
         }
 #pragma unroll
-        for (int q = 0; q < 4; q++)
+        for (int q = 0; q < 4 * PYRAMID_RUNS; q++)
             if (x + PIXELS * q < size.width) store_finished(out, sum[q], size, x + PIXELS * q, y);
     }
 }
