@@ -113,7 +113,7 @@ typedef floath __attribute__((aligned(4))) floath_unaligned;
 typedef floatp __attribute__((aligned(4))) floatp_unaligned;
 
 INLINE floath load_half(const __global float *p) { return *(const __global floath_unaligned *)p; }
-INLINE floatp load_part(const __global float *p) { return *(const __global floatp_unaligned *)p; }
+INLINE void store_half(__global float *p, floath v) { *(__global floath_unaligned *)p = v; }
 INLINE void store_part(__global float *p, floatp v) { *(__global floatp_unaligned *)p = v; }
 
 /* The least of PIXELS values. */
@@ -254,6 +254,7 @@ __kernel void pyramid_slope(__global float *restrict slope, __global float *rest
         floatn nearest = (floatn)(EMPTY), farthest = (floatn)(MAXFLOAT), steepest = (floatn)(0.0f);
         floatn narrowest = (floatn)(1.0f);
         intn holes = (intn)(0);
+#pragma unroll 1
         for (int x = x0; x < x0 + PYRAMID_BLOCK; x += LANES) {
             const size_t at = (size_t)row * pitch + x;
             const floatn w = load_lanes(flat_inv + at), step = slope_of(flat_inv + at, w, x, y, height, pitch, MAXFLOAT);
@@ -455,7 +456,7 @@ INLINE void pull_whole(__global float *color, __global float *inv, const __globa
         store_lanes(color + LANES * h, 0.25f * (even_pixels(a, b) + odd_pixels(a, b)));
     }
     const floatn w = load_lanes(flat_inv + top) + load_lanes(flat_inv + low);
-    *(__global floath_unaligned *)inv = 0.25f * (w.even + w.odd);
+    store_half(inv, 0.25f * (w.even + w.odd));
 }
 
 /* pyramid_cull: culls a sub-image's foreground and pulls level 1 from what is left.
@@ -481,22 +482,29 @@ __kernel void pyramid_cull(__global float *restrict fill, __global float *restri
         const int x0 = first - sub.x;
         const size_t to0 = (size_t)level.x + (size_t)row * level.w + first / 2;
         const PyramidBlock upper = block_of(span, size, ramps, x0, y), lower = block_of(span, size, ramps, x0, y + 1);
-        const int is_empty = upper.first == size.sources && lower.first == size.sources;
-        const int is_whole = upper.kind != BLOCK_MIXED && lower.kind != BLOCK_MIXED;
-        for (int x = x0; x < x0 + PYRAMID_RUN; x += LANES) {
-            const size_t to = to0 + (x - x0) / 2;
-            if (is_empty) {
+        if (upper.first == size.sources && lower.first == size.sources) {
+#pragma unroll
+            for (int j = 0; j < PYRAMID_RUNS; j++) {
+                const size_t to = to0 + 2 * PIXELS * j;
                 store_lanes(fill + to * 4, (floatn)(0.0f));
                 store_lanes(fill + to * 4 + LANES, (floatn)(0.0f));
-                *(__global floath_unaligned *)(fill_inv + to) = (floath)(EMPTY);
-                continue;
+                store_half(fill_inv + to, (floath)(EMPTY));
             }
-            if (is_whole) {
-                pull_whole(fill + to * 4, fill_inv + to, flat, flat_inv,
-                           ((size_t)upper.first * size.height + y) * size.pitch + x,
-                           ((size_t)lower.first * size.height + y + 1) * size.pitch + x);
-                continue;
+            continue;
+        }
+        if (upper.kind != BLOCK_MIXED && lower.kind != BLOCK_MIXED) {
+            const size_t top = ((size_t)upper.first * size.height + y) * size.pitch + x0;
+            const size_t low = ((size_t)lower.first * size.height + y + 1) * size.pitch + x0;
+#pragma unroll
+            for (int j = 0; j < PYRAMID_RUNS; j++) {
+                const size_t to = to0 + 2 * PIXELS * j;
+                pull_whole(fill + to * 4, fill_inv + to, flat, flat_inv, top + LANES * j, low + LANES * j);
             }
+            continue;
+        }
+        for (int j = 0; j < PYRAMID_RUNS; j++) {
+            const int x = x0 + LANES * j;
+            const size_t to = to0 + 2 * PIXELS * j;
             floatn from[2], w[2];
             int only[2];
             cull(&from[0], &only[0], &w[0], flat_inv, slope, broad, size, ramps, x, y, upper);
@@ -784,6 +792,7 @@ __kernel void pyramid_matte(__global float *restrict blur, const __global float 
                 floatn sum[4 * PYRAMID_RUNS];
 #pragma unroll
                 for (int q = 0; q < 4 * PYRAMID_RUNS; q++) sum[q] = (floatn)(0.0f);
+#pragma unroll 1
                 for (int r = 0; r < 2; r++)
                     add_matted(sum, flat, flat_inv, slope, broad, fill, fill_inv, sub, level, size, ramps, x,
                                r ? lower_y : upper_y, r ? lower : upper);
