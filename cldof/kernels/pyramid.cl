@@ -129,8 +129,6 @@ INLINE float least_part(floatp v)
 #endif
 }
 
-INLINE float greatest_part(floatp v) { return -least_part(-v); }
-
 /* Of 2 * PIXELS pixels those with even places, or with odd ones; and one of the former beside one of the latter. */
 INLINE floatn even_pixels(floatn a, floatn b)
 {
@@ -376,73 +374,52 @@ INLINE PyramidBlock block_of(const __global float4 *span, PyramidSize size, Pyra
     return block;
 }
 
-/* The first source of LANES frame pixels, from source `first` on, that a sub-image does not cull.
- * Returns its front ramp, 0 where all sources are culled; there `from` is -1 and `inverse` EMPTY. `only` is the source
- * of all pixels, -1 if all are culled, MIXED if they differ. */
-#define MIXED (-2)
-INLINE floatn cull(floatn *from, int *only, floatn *inverse, const __global float *flat_inv,
-                   const __global float *slope, const __global float *broad, PyramidSize size, PyramidRamps ramps,
-                   int x, int y, PyramidBlock block)
+/* Front ramp of LANES slots of source s, of which `at` is the first. */
+INLINE floatn rise_of(floatn w, int s, size_t at, const __global float *slope, const __global float *broad,
+                      PyramidRamps ramps)
 {
-    floatn rise = (floatn)(0.0f), w = (floatn)(EMPTY), source = (floatn)(-1.0f);
-    *only = -1;
-    for (int s = block.first; s < size.sources; s++) {
-        const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
-        const floatn ws = load_lanes(flat_inv + at);
 #if PYRAMID_PAPER
-        const floatn r = matting_rise(ws, 0, 0, ramps);
+    return matting_rise(w, 0, 0, ramps);
 #else
-        if (block.kind != BLOCK_MIXED) {
-            *only = s;
-            *from = (floatn)((float)s);
-            *inverse = ws;
-            return (floatn)(1.0f);
-        }
-        const floatn r = matting_rise(ws, slope + at, s == 0 ? broad + at : 0, ramps);
+    return matting_rise(w, slope + at, s == 0 ? broad + at : 0, ramps);
 #endif
-        const intn take = rise <= 0.0f && r > 0.0f;
-        w = take ? ws : w;
-        source = take ? (floatn)((float)s) : source;
-        rise = take ? r : rise;
-        const int is_done = !any_lane(w < 0.0f);
-        *only = is_done && *only == -1 ? s : any_lane(w >= 0.0f) ? MIXED : -1;
-        if (is_done) break;
-    }
-    *from = source;
-    *inverse = w;
-    return rise;
 }
 
-/* Colours of PIXELS pixels from the sources that `cull` chose; 0 in holes. */
-INLINE floatn source_pixels(const __global float *flat, PyramidSize size, floatp from, int only, int x, int y)
+/* Adds LANES frame pixels to `color`, `count` and `depth`, each from the first source that a sub-image does not cull;
+ * nothing where it culls all. */
+INLINE void add_culled(floatn color[4], floatn *count, floatn *depth, const __global float *flat,
+                       const __global float *flat_inv, const __global float *slope, const __global float *broad,
+                       PyramidSize size, PyramidRamps ramps, int x, int y, PyramidBlock block)
 {
-    floatn c = (floatn)(0.0f);
-    if (only == -1) return c;
-    if (only >= 0) return load_lanes(flat + (((size_t)only * size.height + y) * size.pitch + x) * 4);
-    for (int s = 0; s < size.sources; s++) {
-        floatp is = from == (float)s ? (floatp)(1.0f) : (floatp)(0.0f);
-        if (greatest_part(is) == 0.0f) continue;
-        c += load_lanes(flat + (((size_t)s * size.height + y) * size.pitch + x) * 4) * spread(is);
+    intn open = (intn)(-1);
+    for (int s = block.first; s < size.sources; s++) {
+        const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
+        const floatn w = load_lanes(flat_inv + at);
+        intn take = open;
+        if (block.kind == BLOCK_MIXED) take = open && rise_of(w, s, at, slope, broad, ramps) > 0.0f;
+        if (!any_lane(take)) continue;
+        const floatn one = take ? (floatn)(1.0f) : (floatn)(0.0f);
+        const floatp taken[4] = FOUR_PARTS(one);
+#pragma unroll
+        for (int q = 0; q < 4; q++) color[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread(taken[q]);
+        *count += one;
+        *depth += w * one;
+        open = open && !take;
+        if (!any_lane(open)) break;
     }
-    return c;
 }
 
 /* --- disocclusion (section 3.2): pull-push --- */
 
-/* PIXELS coarser pixels from two rows of twice as many finer ones: the mean of those of 2x2 that are no holes. Holes
- * hold colour 0 and a negative inverse depth. */
-INLINE void pull_pixels(__global float *color, __global float *inv, floatn top0, floatn top1, floath w_top,
-                        floatn low0, floatn low1, floath w_low)
+/* PIXELS coarser pixels from twice as many finer ones, two rows of which are summed up: the mean of those of 2x2 that
+ * are no holes, which `count` tells. Holes hold colour 0 and a negative inverse depth. */
+INLINE void pull_pixels(__global float *color, __global float *inv, floatn left, floatn right, floath count,
+                        floath depth)
 {
-    floath known_top = w_top < 0.0f ? (floath)(0.0f) : (floath)(1.0f);
-    floath known_low = w_low < 0.0f ? (floath)(0.0f) : (floath)(1.0f);
-    floath known = known_top + known_low, w = known_top * w_top + known_low * w_low;
-    floatn a = top0 + low0, b = top1 + low1;
-    floatn sum = even_pixels(a, b) + odd_pixels(a, b);
-    floatp count = known.even + known.odd, depth = w.even + w.odd;
-    floatp scale = count > 0.0f ? 1.0f / count : (floatp)(0.0f);
-    store_lanes(color, sum * spread(scale));
-    store_part(inv, count > 0.0f ? depth * scale : (floatp)(EMPTY));
+    const floatp known = count.even + count.odd;
+    const floatp scale = known > 0.0f ? 1.0f / known : (floatp)(0.0f);
+    store_lanes(color, (even_pixels(left, right) + odd_pixels(left, right)) * spread(scale));
+    store_part(inv, known > 0.0f ? (depth.even + depth.odd) * scale : (floatp)(EMPTY));
 }
 
 /* The same for 2 * PIXELS coarser pixels where there are no holes. */
@@ -505,22 +482,14 @@ __kernel void pyramid_cull(__global float *restrict fill, __global float *restri
         for (int j = 0; j < PYRAMID_RUNS; j++) {
             const int x = x0 + LANES * j;
             const size_t to = to0 + 2 * PIXELS * j;
-            floatn from[2], w[2];
-            int only[2];
-            cull(&from[0], &only[0], &w[0], flat_inv, slope, broad, size, ramps, x, y, upper);
-            cull(&from[1], &only[1], &w[1], flat_inv, slope, broad, size, ramps, x, y + 1, lower);
-#pragma unroll
-            for (int h = 0; h < 2; h++) { /* halves of the run */
-                floatn c[2][2];
-#pragma unroll
-                for (int r = 0; r < 2; r++) {
-                    const floatp f[4] = FOUR_PARTS(from[r]);
-                    c[r][0] = source_pixels(flat, size, f[2 * h], only[r], x + 2 * PIXELS * h, y + r);
-                    c[r][1] = source_pixels(flat, size, f[2 * h + 1], only[r], x + 2 * PIXELS * h + PIXELS, y + r);
-                }
-                pull_pixels(fill + (to + PIXELS * h) * 4, fill_inv + to + PIXELS * h, c[0][0], c[0][1],
-                            h ? w[0].hi : w[0].lo, c[1][0], c[1][1], h ? w[1].hi : w[1].lo);
-            }
+            floatn color[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
+            floatn known = (floatn)(0.0f), depth = (floatn)(0.0f);
+#pragma unroll 1
+            for (int r = 0; r < 2; r++)
+                add_culled(color, &known, &depth, flat, flat_inv, slope, broad, size, ramps, x, y + r,
+                           r ? lower : upper);
+            pull_pixels(fill + to * 4, fill_inv + to, color[0], color[1], known.lo, depth.lo);
+            pull_pixels(fill + (to + PIXELS) * 4, fill_inv + to + PIXELS, color[2], color[3], known.hi, depth.hi);
         }
     }
 }
@@ -547,10 +516,12 @@ __kernel void pyramid_pull(__global float *restrict fill, __global float *restri
         const size_t top = (size_t)fine.x + (size_t)(2 * row) * fine.w + 2 * x;
         const size_t low = top + (has_low ? fine.w : 0);
         const float keep = has_low ? 1.0f : 0.0f;
-        floath w_low = has_low ? load_half(fill_inv + low) : (floath)(EMPTY);
-        pull_pixels(fill + to * 4, fill_inv + to, load_lanes(fill + top * 4), load_lanes(fill + top * 4 + LANES),
-                    load_half(fill_inv + top), load_lanes(fill + low * 4) * keep,
-                    load_lanes(fill + low * 4 + LANES) * keep, w_low);
+        const floath upper = load_half(fill_inv + top), lower = has_low ? load_half(fill_inv + low) : (floath)(EMPTY);
+        const floath in_upper = upper < 0.0f ? (floath)(0.0f) : (floath)(1.0f);
+        const floath in_lower = lower < 0.0f ? (floath)(0.0f) : (floath)(1.0f);
+        pull_pixels(fill + to * 4, fill_inv + to, load_lanes(fill + top * 4) + load_lanes(fill + low * 4) * keep,
+                    load_lanes(fill + top * 4 + LANES) + load_lanes(fill + low * 4 + LANES) * keep,
+                    in_upper + in_lower, in_upper * upper + in_lower * lower);
     }
 }
 
@@ -660,50 +631,43 @@ INLINE void add_mixed(floatn quad[4], const __global float *flat, const __global
                       const __global float *fill_inv, int4 sub, int4 level, PyramidSize size, PyramidRamps ramps, int x,
                       int y, PyramidBlock block)
 {
-    floatn from, w;
-    int only;
-    floatn weight = cull(&from, &only, &w, flat_inv, slope, broad, size, ramps, x, y, block);
-    /* What a visible surface with a share of its weight lets through of the next that is not culled. */
-    floatn lets = from == 0.0f ? 1.0f - weight : (floatn)(0.0f);
-    weight *= matting_fall(w, ramps.ramp);
-    floatn filled = (floatn)(0.0f); /* weight of holes */
-    const Between rows = between(level, y + sub.x);
-    if (only < 0) {
-        floatn v = expand_depth(fill_inv, rows, (x + sub.x) / 2);
-        filled = matting_rise(v, 0, 0, ramps) * matting_fall(v, ramps.ramp);
-        filled = w < 0.0f ? filled : (floatn)(0.0f);
-    }
-    if (any_lane(weight > 0.0f)) {
-        const floatp sources[4] = FOUR_PARTS(from), weights[4] = FOUR_PARTS(weight);
-#pragma unroll
-        for (int q = 0; q < 4; q++)
-            quad[q] += source_pixels(flat, size, sources[q], only, x + PIXELS * q, y) * spread(weights[q]);
-    }
-#if !PYRAMID_PAPER
-    if (any_lane(lets > 0.0f)) {
-        for (int s = 1; s < size.sources; s++) {
-            const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
-            floatn ws = load_lanes(flat_inv + at);
-            floatn r = lets * matting_rise(ws, slope + at, 0, ramps);
-            lets = r > 0.0f ? (floatn)(0.0f) : lets;
-            r *= matting_fall(ws, ramps.ramp);
-            if (!any_lane(r > 0.0f)) continue;
-            const floatp weights[4] = FOUR_PARTS(r);
+    const floatn zero = (floatn)(0.0f), one = (floatn)(1.0f);
+    floatn open = one; /* what the sources so far let through */
+    intn holes = (intn)(-1);
+    for (int s = block.first; s < size.sources; s++) {
+        const size_t at = ((size_t)s * size.height + y) * size.pitch + x;
+        const floatn w = load_lanes(flat_inv + at);
+        floatn weight = open * rise_of(w, s, at, slope, broad, ramps);
+        const intn take = weight > 0.0f;
+        if (!any_lane(take)) continue;
+        holes = holes && !take;
+#if PYRAMID_PAPER
+        open = take ? zero : open;
+#else
+        /* A visible surface with a share of its weight lets through the next that is not culled. */
+        open = take ? (s == 0 ? one - weight : zero) : open;
+#endif
+        weight *= matting_fall(w, ramps.ramp);
+        const floatp weights[4] = FOUR_PARTS(weight);
+        if (any_lane(weight > 0.0f)) {
 #pragma unroll
             for (int q = 0; q < 4; q++) quad[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread(weights[q]);
-            if (!any_lane(lets > 0.0f)) break;
         }
+        if (!any_lane(open > 0.0f)) return;
     }
-#endif
-    if (any_lane(filled > 0.0f)) {
-        const floatp weights[4] = FOUR_PARTS(filled);
+    if (!any_lane(holes)) return;
+    const Between rows = between(level, y + sub.x);
+    const floatn v = expand_depth(fill_inv, rows, (x + sub.x) / 2);
+    const floatn filled = holes ? matting_rise(v, 0, 0, ramps) * matting_fall(v, ramps.ramp) : zero;
+    if (!any_lane(filled > 0.0f)) return;
+    const floatp weights[4] = FOUR_PARTS(filled);
+#pragma unroll 1 /* both at once take more registers than a GPU gives */
+    for (int h = 0; h < 2; h++) {
+        floatn c[2];
+        expand_pixels(c, fill, rows, (x + sub.x) / 2 + PIXELS * h);
 #pragma unroll
-        for (int h = 0; h < 2; h++) {
-            floatn c[2];
-            expand_pixels(c, fill, rows, (x + sub.x) / 2 + PIXELS * h);
-            quad[2 * h] += c[0] * spread(weights[2 * h]);
-            quad[2 * h + 1] += c[1] * spread(weights[2 * h + 1]);
-        }
+        for (int q = 0; q < 4; q++)
+            if (q / 2 == h) quad[q] += c[q % 2] * spread(weights[q]);
     }
 }
 

@@ -44,8 +44,9 @@ MAX_STEPS = 9
 _LEVELS = 16
 _COUNT = 24
 _ROWS = 8
-# The least margin, in px: blocks of 16 pixels then lie either inside the frame or outside.
-_MARGIN = 16
+_BLOCK = 16
+# The least margin, in px: blocks then lie either inside the frame or outside.
+_MARGIN = _BLOCK
 
 # Sides whose largest sigma (px) stays below this get no sub-images.
 _NEGLIGIBLE_SIGMA_PX = 5e-4
@@ -397,6 +398,8 @@ class _Builder:
         self.is_cpu, self.local_limit = traits.is_cpu, traits.local_mem_bytes
         # GPU values are reasoned, not measured.
         self.items = 1 if traits.is_cpu else min(64, traits.max_work_group_size)
+        # What is known of a block is looked up once for all of it; on GPUs there are more items instead.
+        self.run = _BLOCK if traits.is_cpu else traits.lanes
         self.sources = shape.layers if method.hidden == "peels" else 1
         self.table, pixels = level_table(shape, chosen)
         self.level_pixels = pixels
@@ -439,6 +442,7 @@ class _Builder:
             ("PYRAMID_VOID", int(not self.shape.is_opaque)),
             ("PYRAMID_ALPHA", alpha),
             ("PYRAMID_DIVIDE", int(self.method.normalise)),
+            ("PYRAMID_RUN", self.run),
         )
 
     def _run(self, run: str, alpha: int) -> None:
@@ -520,7 +524,8 @@ class _Builder:
     def _matte(self, blur: Any, args: tuple[Any, ...]) -> None:
         widest, highest = (int(self.table[:, 1, column].max()) for column in (1, 2))
         fits = (self.local_limit - 256) // 64 - 16  # two lines of 2 * segment + 32 pixels
-        segment = min(-(-widest // 16) * 16, fits if self.is_cpu else 128) // 16 * 16
+        one_each = self.items * self.run // 2 - 16  # every item has a run of such a line
+        segment = max(min(-(-widest // 16) * 16, fits if self.is_cpu else one_each) // 16 * 16, 16)
         # Rows of sub-images with smaller margins start later.
         blocks = -(-(highest + int(self.size["top"]) // 2) // _ROWS)
         self._add(
