@@ -219,23 +219,27 @@ def test_matting_meets_the_oracle(device: Device, size: tuple[int, int], options
             assert_close(done.level("rgb_blur", index, 1), expected, "pyramid_matte")
 
 
-def test_matting_in_narrow_segments(device: Device) -> None:
-    """As on devices with little local memory."""
+@pytest.mark.parametrize("hidden", ["peels", "interpolated"])
+def test_forms_for_devices_agree(device: Device, hidden: str) -> None:
+    """Narrow segments, as with little local memory; an item per run of pixels and groups of many, as on GPUs."""
     frame = noise_frame(310, 40)
-    small = dataclasses.replace(device.traits, local_mem_bytes=6000)
-    method = Pyramid(sub_images=(-3, 2))
+    method = Pyramid(sub_images=(-3, 2), hidden=hidden)
     lens = Lens(9.0 / frame.camera.focal_px, 1.7)
     plan, shape = method.plan(frame, lens), FrameShape.of(frame)
-    inv_depth = np.full((shape.layers, shape.height, shape.pitch), oracle.EMPTY, np.float32)
-    inv_depth[:, :, : shape.width] = inverse_of(frame)
-    inputs = {"color": frame.color, "inv_depth": inv_depth}
+    inputs = {"color": frame.color, "inv_depth": inverse_depth(device, frame)}
     images = [
         run_program(
-            device, method.program(shape, plan, traits), inputs, dict(plan.params), "image", (*shape.output_size, 4)
+            device,
+            method.program(shape, plan, dataclasses.replace(device.traits, **told)),
+            inputs,
+            dict(plan.params),
+            "image",
+            (*shape.output_size, 4),
         )
-        for traits in (device.traits, small)
+        for told in ({}, {"local_mem_bytes": 6000}, {"is_cpu": False})
     ]
-    np.testing.assert_array_equal(*images)
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_array_equal(images[0], images[2])
 
 
 @pytest.mark.parametrize("size", SIZES)
