@@ -41,20 +41,20 @@ static inline int greatest_int(intn v)
     return c.x > c.y ? c.x : c.y;
 }
 
-/* LANES values of a row, whose ends repeat. */
-static inline floatn values_at(const __global float *row, int x, int last)
+/* LANES values of a row, which holds all of them if `is_inside`, else its ends repeat. */
+static inline floatn values_at(const __global float *row, int x, int last, int is_inside)
 {
-    if (x >= 0 && x + LANES - 1 <= last) return load_lanes(row + x);
+    if (is_inside) return load_lanes(row + x);
     float v[LANES];
 #pragma unroll
     for (int i = 0; i < LANES; i++) v[i] = row[clamp_index(x + i, last)];
     return load_lanes_private(v);
 }
 
-/* PIXELS pixels of a row, whose ends repeat. */
-static inline floatn pixels_at(const __global float *row, int x, int last)
+/* The same for PIXELS pixels. */
+static inline floatn pixels_at(const __global float *row, int x, int last, int is_inside)
 {
-    if (x >= 0 && x + PIXELS - 1 <= last) return load_lanes(row + 4 * x);
+    if (is_inside) return load_lanes(row + 4 * x);
 #define EDGE_PIXEL(i) load_pixel(row + 4 * clamp_index(x + i, last))
     return PIXELS_OF(EDGE_PIXEL);
 #undef EDGE_PIXEL
@@ -80,7 +80,8 @@ __kernel void gather_blur(__global float *restrict out, const __global float *re
     for (int ox = LANES * get_global_id(0); ox < width; ox += LANES * get_global_size(0)) {
         const int x = ox + size.guard;
         const size_t row = (size_t)y * size.pitch;
-        const floatn coc = c1 * values_at(flat_inv + row, x, end) + c0;
+        const int is_whole = x + LANES - 1 <= end;
+        const floatn coc = c1 * values_at(flat_inv + row, x, end, is_whole) + c0;
         const floatn radius = lesser(absolute(coc), (floatn)(last));
         const floatn within = to_floatn(as_intn(radius) & ((1 << STEP_BITS) - 1)) * (1.0f / (1 << STEP_BITS));
         intn step = (as_intn(radius) >> STEP_BITS) - FIRST_STEP; /* below 0: in focus, and all of this pixel is its own */
@@ -94,26 +95,26 @@ __kernel void gather_blur(__global float *restrict out, const __global float *re
             for (int k = first[now]; k < first[now + 1]; k++) {
                 const GatherTap tap = taps[k];
                 const size_t there = (size_t)clamp_index(y + tap.dy, size.height - 1) * size.pitch;
+                const int at = x + tap.dx, is_inside = at >= 0 && at + LANES - 1 <= end;
                 floatn weight = mine * tap.weight + part * tap.change;
 #if GATHER_DEPTH_AWARE
-                const floatn theirs = c1 * values_at(flat_inv + there, x + tap.dx, end) + c0;
+                const floatn theirs = c1 * values_at(flat_inv + there, at, end, is_inside) + c0;
                 floatn reach = absolute(theirs) + 1.0f - lesser((floatn)(tap.distance), radius); /* rims are soft */
-                reach = greater(reach, zero);
-                weight *= theirs > coc || reach > 1.0f ? one : reach;
+                reach = lesser(greater(reach, zero), one);
+                weight *= theirs > coc ? one : reach;
 #endif
-                const floatp weights[4] = FOUR_PARTS(weight);
 #pragma unroll
                 for (int q = 0; q < 4; q++)
-                    sum[q] += spread(weights[q]) * pixels_at(flat + there * 4, x + tap.dx + PIXELS * q, end);
+                    sum[q] += spread_part(weight, q) * pixels_at(flat + there * 4, at + PIXELS * q, end, is_inside);
                 total += weight;
             }
         }
-        const floatp totals[4] = FOUR_PARTS(total); /* not 0 where there are taps: one is the pixel itself */
 #pragma unroll
         for (int q = 0; q < 4; q++) {
             const int n = width - ox - PIXELS * q;
             if (n <= 0) break;
-            const floatn weights = spread(totals[q]), own = pixels_at(flat + row * 4, x + PIXELS * q, end);
+            const floatn own = pixels_at(flat + row * 4, x + PIXELS * q, end, is_whole);
+            const floatn weights = spread_part(total, q); /* not 0 where there are taps: one is the pixel itself */
             store_pixels(out + ((size_t)(y - size.guard) * width + ox + PIXELS * q) * 4,
                          weights > 0.0f ? sum[q] / weights : own, n);
         }
