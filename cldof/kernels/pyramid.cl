@@ -215,10 +215,10 @@ __kernel void pyramid_flatten(__global float *restrict flat, __global float *res
 #endif
         const size_t to = (size_t)row * size.pitch + x;
         store_lanes(flat_inv + to, depth);
-        const floatp scales[4] = FOUR_PARTS(scale), coverage[4] = FOUR_PARTS(known);
+        const floatp coverage[4] = FOUR_PARTS(known);
 #pragma unroll
         for (int q = 0; q < 4; q++) {
-            floatn c = image[q] * spread(scales[q]);
+            floatn c = image[q] * spread_part(scale, q);
 #if PYRAMID_ALPHA == 0
             c.ALPHA = coverage[q];
 #elif PYRAMID_ALPHA == 1
@@ -399,9 +399,8 @@ INLINE void add_culled(floatn color[4], floatn *count, floatn *depth, const __gl
         if (block.kind == BLOCK_MIXED) take = open && rise_of(w, s, at, slope, broad, ramps) > 0.0f;
         if (!any_lane(take)) continue;
         const floatn one = take ? (floatn)(1.0f) : (floatn)(0.0f);
-        const floatp taken[4] = FOUR_PARTS(one);
 #pragma unroll
-        for (int q = 0; q < 4; q++) color[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread(taken[q]);
+        for (int q = 0; q < 4; q++) color[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread_part(one, q);
         *count += one;
         *depth += w * one;
         open = open && !take;
@@ -619,8 +618,8 @@ __kernel void pyramid_push(__global float *restrict fill, __global float *restri
             floatn c[2];
             expand_pixels(c, fill, rows, x / 2 + PIXELS * h);
             __global float *at = fill + (to + 2 * PIXELS * h) * 4;
-            store_lanes(at, spread(depth[2 * h]) < 0.0f ? c[0] : load_lanes(at));
-            store_lanes(at + LANES, spread(depth[2 * h + 1]) < 0.0f ? c[1] : load_lanes(at + LANES));
+            store_lanes(at, spread_part(w, 2 * h) < 0.0f ? c[0] : load_lanes(at));
+            store_lanes(at + LANES, spread_part(w, 2 * h + 1) < 0.0f ? c[1] : load_lanes(at + LANES));
         }
     }
 }
@@ -648,10 +647,9 @@ INLINE void add_mixed(floatn quad[4], const __global float *flat, const __global
         open = take ? (s == 0 ? one - weight : zero) : open;
 #endif
         weight *= matting_fall(w, ramps.ramp);
-        const floatp weights[4] = FOUR_PARTS(weight);
         if (any_lane(weight > 0.0f)) {
 #pragma unroll
-            for (int q = 0; q < 4; q++) quad[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread(weights[q]);
+            for (int q = 0; q < 4; q++) quad[q] += load_lanes(flat + (at + PIXELS * q) * 4) * spread_part(weight, q);
         }
         if (!any_lane(open > 0.0f)) return;
     }
@@ -660,14 +658,13 @@ INLINE void add_mixed(floatn quad[4], const __global float *flat, const __global
     const floatn v = expand_depth(fill_inv, rows, (x + sub.x) / 2);
     const floatn filled = holes ? matting_rise(v, 0, 0, ramps) * matting_fall(v, ramps.ramp) : zero;
     if (!any_lane(filled > 0.0f)) return;
-    const floatp weights[4] = FOUR_PARTS(filled);
 #pragma unroll 1 /* both at once take more registers than a GPU gives */
     for (int h = 0; h < 2; h++) {
         floatn c[2];
         expand_pixels(c, fill, rows, (x + sub.x) / 2 + PIXELS * h);
 #pragma unroll
         for (int q = 0; q < 4; q++)
-            if (q / 2 == h) quad[q] += c[q % 2] * spread(weights[q]);
+            if (q / 2 == h) quad[q] += c[q % 2] * spread_part(filled, q);
     }
 }
 
@@ -683,10 +680,9 @@ INLINE void add_matted(floatn sum[4 * PYRAMID_RUNS], const __global float *flat,
 #pragma unroll
         for (int j = 0; j < PYRAMID_RUNS; j++) {
             const floatn weight = matting_fall(load_lanes(flat_inv + at + LANES * j), ramps.ramp);
-            const floatp weights[4] = FOUR_PARTS(weight);
 #pragma unroll
             for (int q = 0; q < 4; q++)
-                sum[4 * j + q] += load_lanes(flat + (at + LANES * j + PIXELS * q) * 4) * spread(weights[q]);
+                sum[4 * j + q] += load_lanes(flat + (at + LANES * j + PIXELS * q) * 4) * spread_part(weight, q);
         }
         return;
     }
