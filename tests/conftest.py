@@ -104,13 +104,13 @@ class CanaryPool(BufferPool):
 
     def trampled(self) -> list[str]:
         """What was written outside its buffer; forgets buffers that are no longer in use."""
-        self._queue.finish()
+        if self._parents:
+            self._queue.finish()
         found = []
+        margin = np.empty(self._margin, np.uint8)
         for address, (parent, _, nbytes) in list(self._parents.items()):
-            contents = np.empty(nbytes + 2 * self._margin, np.uint8)
-            cl.enqueue_copy(self._queue, contents, parent)
-            margins = (("before", contents[: self._margin]), ("after", contents[-self._margin :]))
-            for side, margin in margins:
+            for side, start in (("before", 0), ("after", self._margin + nbytes)):
+                cl.enqueue_copy(self._queue, margin, parent, src_offset=start)
                 wrong = np.flatnonzero(margin != CANARY)
                 if wrong.size:
                     found.append(f"{wrong.size} bytes written {side} a buffer of {nbytes}, first at {wrong[0]}")

@@ -6,7 +6,7 @@ vectors and arrays, which it does not follow, to ``python -m tests.tools.checked
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
 
@@ -31,9 +31,11 @@ def programs() -> set[Program]:
     return set()
 
 
-@pytest.fixture(scope="module")
-def canaried(device_info: DeviceInfo, open_device: Callable[..., Device]) -> Device:
-    return open_device(device_info)
+@pytest.fixture
+def canaried(device_info: DeviceInfo, open_device: Callable[..., Device]) -> Iterator[Device]:
+    """Closed after each test: its buffers would be looked at after all tests that follow."""
+    with open_device(device_info) as device:
+        yield device
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
