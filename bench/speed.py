@@ -266,8 +266,8 @@ def _image_buffers() -> list[Buffer]:
 def _fir_program(sigma: float) -> FrameProgram:
     # 3.3 sigma: within 1.5e-3 of the exact Gaussian for any image in [0, 1].
     taps = gaussian.fir_taps(sigma, cutoff=3.3)
-    data, radius, segment, rows = gaussian.padded_taps(taps), len(taps) // 2, 512, 8
-    halo = (radius + 7) & ~3
+    data, radius, segment, rows = gaussian.half_taps(taps), len(taps) // 2, 512, 8
+    halo = (radius + 4) & ~3
     sizes = (np.int32(n) for n in (SIZE, SIZE, row_pitch(SIZE), radius, segment))
     blur = Pass(
         "blur",

@@ -9,35 +9,38 @@
 /* blur_fir: both directions of a separable FIR filter in one pass.
  * source  direct convolution; the taps come from cldof.methods.gaussian.fir_taps
  * reads   image  float[height][pitch][4]
- *         taps   float[2*radius + 1 + 2*FIR_PAD]  centre at FIR_PAD + radius
+ *         taps   float[radius + 1]  from the middle outwards
  * writes  out    float[height][pitch][4], not image
  * range   2-D groups: (segments of a row, blocks of FIR_ROWS rows); local size (any, 1)
- * local   lines  float[FIR_ROWS][segment + 2*halo][4], halo = radius + 4 rounded up to a multiple of 4 */
+ * local   lines  float[segment + 2*halo][FIR_LINE], halo = the multiple of 4 above radius */
 __kernel void blur_fir(__global float *restrict out, const __global float *restrict image,
                        const __global float *restrict taps, int width, int height, int pitch, int radius, int segment,
                        __local float *restrict lines)
 {
-    const int halo = (radius + 7) & ~3;
+    const int halo = (radius + 4) & ~3;
     const int line_width = segment + 2 * halo;
     const int x0 = (int)get_group_id(0) * segment;
     const int y0 = (int)get_group_id(1) * FIR_ROWS;
-    const __global float *centre = taps + FIR_PAD + radius;
 
     for (int b = get_local_id(0); b < line_width / PIXELS; b += get_local_size(0)) {
         int x = x0 - halo + PIXELS * b;
         if (x < 0 || x >= width) continue;
-        floatn acc[FIR_ROWS];
-        fir_columns(acc, image, x, y0, height, pitch, centre, radius);
+        for (int row = 0; row < FIR_ROWS && y0 + row < height; row += FIR_RUN) {
+            __local float *line = lines + PIXELS * b * FIR_LINE + 4 * row;
+            floatn acc[FIR_RUN];
+            fir_columns(acc, image, x, y0 + row, height, pitch, taps, radius);
+            fir_turn(acc);
 #pragma unroll
-        for (int i = 0; i < FIR_ROWS; i++) store_lanes_local(lines + (i * line_width + PIXELS * b) * 4, acc[i]);
+            for (int i = 0; i < FIR_RUN; i++) store_lanes_local(line + fir_place(i), acc[i]);
+        }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     fir_extend_lines(lines, line_width, x0 - halo, width);
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (int b = get_local_id(0); b < segment / (2 * PIXELS); b += get_local_size(0)) {
-        int x = x0 + 2 * PIXELS * b;
-        if (x < pitch)
-            fir_store_pair(out, lines, line_width, 2 * PIXELS * b + halo, x, y0, height, pitch, centre, radius);
+    for (int b = get_local_id(0); b < segment / FIR_RUN * FIR_GROUPS; b += get_local_size(0)) {
+        int x = b / FIR_GROUPS * FIR_RUN, row = b % FIR_GROUPS * PIXELS;
+        if (x0 + x < pitch)
+            fir_store(out, lines + (x + halo) * FIR_LINE + 4 * row, x0 + x, y0 + row, height, pitch, taps, radius);
     }
 }
 

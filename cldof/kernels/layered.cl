@@ -66,7 +66,7 @@ typedef struct {
     int in_front;    /* 1: what is composed so far lies in front of this layer, 0: behind it */
     int below;       /* 0: nothing composed so far, 1: `image`, where `reached` says so, 2: `image` everywhere */
     int radius_in;   /* column filter still owed to `image` */
-    int taps_in;     /* and where its middle tap stands */
+    int taps_in;     /* and where its taps start */
     int radius_out;  /* row filter of this step */
     int taps_out;
     int segment;     /* pixels of a row a work-group owns, a multiple of LAYERED_TILE */
@@ -114,25 +114,25 @@ static inline floatn layered_weight(const __global float *inv_depth, const __glo
     down = peel > 0 ? at_once : down;
 #else
     if (peel > 0) down = before * layer.own.z + layer.own.w >= 1.0f ? down : at_once;
-    floatn between = rising > 0.0f && rising < 1.0f ? one : zero;
-    if (sum_lanes(between) > 0.0f) {
+    const intn between = (rising > 0.0f) & (rising < 1.0f);
+    if (any_lane(between)) {
         floatn part = slope_of(inv, w, x, y, size.height, size.pitch, -1.0f / layer.own.x);
         part *= -layer.own.x * layer.reach;
         part = part > 1.0f ? one : part;
         part = part < 1e-3f ? (floatn)(1e-3f) : part;
         up = clamp01((rising - 1.0f) / part + 1.0f);
-        floatn early = between * up;
-        if (peel == 0 && sum_lanes(early) > 0.0f) {
+        const intn early = between & (up > 0.0f);
+        if (peel == 0 && any_lane(early)) {
             floatn broad = layered_breadth(inv_depth, w, size, layer, x, y) * 2.0f - 1.0f;
-            up = early > 0.0f ? up * clamp01(broad) : up;
+            up = early ? up * clamp01(broad) : up;
         }
     }
     floatn rest = clamp01(w * layer.before.z + layer.before.w); /* 1 - t */
-    floatn shared = rising >= 1.0f && falling >= 1.0f && w >= 0.0f ? rest : zero;
-    if (peel == 0 && sum_lanes(shared) > 0.0f) {
+    const intn shared = (rising >= 1.0f) & (falling >= 1.0f) & (w >= 0.0f) & (rest > 0.0f);
+    if (peel == 0 && any_lane(shared)) {
         floatn others = 1.0f - rest * layered_breadth(inv_depth, w, size, layer, x, y);
-        up = shared > 0.0f ? (1.0f - rest) / (others > 1e-3f ? others : (floatn)(1e-3f)) : up;
-        up = shared > 0.0f && others <= 1e-3f ? one : up;
+        up = shared ? (1.0f - rest) / (others > 1e-3f ? others : (floatn)(1e-3f)) : up;
+        up = (shared & (others <= 1e-3f)) ? one : up;
     }
 #endif
     return w < 0.0f ? zero : up * down;
@@ -189,7 +189,7 @@ static inline void layered_block(floatn quad[4], const __global float *color, co
             before = is_past_nothing ? load_lanes(inv - (size_t)p * size.height * size.pitch) : before;
         }
         floatn weight = layered_weight(inv_depth, inv, w, before, layer, m, size, x, y);
-        if (sum_lanes(weight) <= 0.0f) continue;
+        if (!any_lane(weight > 0.0f)) continue;
         const __global float *rgba = color + (row * size.width + x) * 4;
         floatp weights[4] = FOUR_PARTS(weight);
         const floatp inverse[4] = FOUR_PARTS(w);
@@ -208,26 +208,43 @@ static inline void layered_block(floatn quad[4], const __global float *color, co
             quad[q] = over(quad[q], c * spread(weights[q]));
         }
         /* Nothing shows through opaque pixels: no need to read the peels behind them. */
-        if (sum_lanes(CHANNEL_OF(quad, ALPHA)) >= (float)LANES) break;
+        if (!any_lane(lesser(lesser(quad[0], quad[1]), lesser(quad[2], quad[3])).ALPHAS < 1.0f)) break;
     }
 }
 
-/* Whether the pixels at `line` are opaque in all rows: then there is no point in filtering what lies behind. */
-static inline int layered_hides(const __local float *line, int line_width)
+/* Put the LANES pixels of a row into lines; `line` is where the first one goes. */
+static inline void layered_put(__local float *line, const floatn quad[4])
+{
+#pragma unroll
+    for (int q = 0; q < 4; q++)
+#pragma unroll
+        for (int i = 0; i < PIXELS; i++) store_pixel_local(line + (PIXELS * q + i) * FIR_LINE, pixel_of(quad[q], i));
+}
+
+/* Whether the PIXELS pixels at `line` are opaque in all rows: then there is no point in filtering what lies behind. */
+static inline int layered_hides(const __local float *line)
 {
     floatn covered = (floatn)(0.0f);
-    for (int i = 0; i < FIR_ROWS; i++) covered += load_lanes_local(line + i * line_width * 4);
+#pragma unroll
+    for (int i = 0; i < PIXELS; i++)
+#pragma unroll
+        for (int row = 0; row < 4 * FIR_ROWS; row += LANES) covered += load_lanes_local(line + i * FIR_LINE + row);
     return sum_pixels(covered).w >= (float)(PIXELS * FIR_ROWS);
 }
 
-/* Compose filtered pixels with those at `line`. */
-static inline void layered_add(__local float *line, int line_width, const floatn filtered[FIR_ROWS], int in_front)
+/* Compose FIR_RUN rows of PIXELS filtered pixels with those at `line`, where there are any. */
+static inline void layered_add(__local float *line, floatn filtered[FIR_RUN], int is_there, int in_front)
 {
+    fir_turn(filtered);
 #pragma unroll
-    for (int i = 0; i < FIR_ROWS; i++) {
-        __local float *at = line + i * line_width * 4;
-        floatn layer = load_lanes_local(at);
-        store_lanes_local(at, in_front ? over(filtered[i], layer) : over(layer, filtered[i]));
+    for (int i = 0; i < FIR_RUN; i++) {
+        __local float *at = line + fir_place(i);
+        floatn v = filtered[i];
+        if (is_there) {
+            floatn layer = load_lanes_local(at);
+            v = in_front ? over(v, layer) : over(layer, v);
+        }
+        store_lanes_local(at, v);
     }
 }
 
@@ -295,13 +312,14 @@ __kernel void layered_classify(__global uint *restrict tile_peels, const __globa
  *         color       float[peels][height][width][4]
  *         inv_depth   float[peels][height][pitch]
  *         tile_peels  uint[layers][tiles_y][tiles_x]
- *         taps        float[]                           all FIR taps, padded
+ *         taps        float[]                           all FIR taps
  *         matting     LayeredMatting
  * writes  out         float[height][pitch][4]
  *         reached_out int[tiles_y][tiles_x]
  * range   2-D groups: (segments of a row, blocks of FIR_ROWS rows); local size (any, 1)
- * local   lines  float[FIR_ROWS][segment + 2*halo][4], halo = radius_out + 4 rounded up to a multiple of 16
- *         state  int[segment / LAYERED_TILE + 2*ceil(halo / LAYERED_TILE)]  per tile: 1 blur reached it, 2 layer does */
+ * local   lines  float[segment + 2*halo][FIR_LINE], halo = radius_out rounded up to a multiple of 16
+ *         state  int[2 * segment / LAYERED_TILE + 2*ceil(halo / LAYERED_TILE)]  per tile: 1 blur reached it, 2 layer does;
+ *                then per tile of the segment whether anything is written */
 __kernel void layered_step(__global float *restrict out, __global int *restrict reached_out,
                            const __global float *restrict image, const __global int *restrict reached,
                            const __global float *restrict color, const __global float *restrict inv_depth,
@@ -310,13 +328,14 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
                            __local float *restrict lines, __local int *restrict state)
 {
     const int lid = get_local_id(0), items = get_local_size(0);
-    const int halo = (step.radius_out + 19) & ~15; /* blocks of 16 pixels stay aligned */
+    const int halo = (step.radius_out + 15) & ~15; /* blocks of LANES pixels stay aligned */
     const int halo_tiles = (halo + LAYERED_TILE - 1) / LAYERED_TILE;
     const int line_width = step.segment + 2 * halo;
     const int x0 = (int)get_group_id(0) * step.segment;
     const int ty = (int)get_group_id(1);
     const int y0 = ty * FIR_ROWS;
     const int segment_tiles = step.segment / LAYERED_TILE;
+    __local int *is_written = state + segment_tiles + 2 * halo_tiles;
     const int tile0 = x0 / LAYERED_TILE - halo_tiles; /* state[0] */
     const LayeredLayer own = layered_layer(matting, step.layer);
     const __global uint *layer_peels = tile_peels + ((size_t)step.layer * size.tiles_y + ty) * size.tiles_x;
@@ -332,53 +351,57 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    /* The layer by itself first, then what is composed so far: loops that mix both run at half the speed on CPUs. */
-    for (int b = lid; b < line_width / LANES; b += items) {
+    /* The layer by itself first, then what is composed so far: loops that mix both run at half the speed on CPUs. Rows are
+     * the outer loop, for the sake of what CPUs load ahead. */
+    const int blocks = line_width / LANES;
+    for (int b = lid, i = 0; i < FIR_ROWS; b += items) {
+        for (; b >= blocks; b -= blocks) i++;
         int x = x0 - halo + LANES * b;
-        if (x < 0 || x >= size.width) continue;
+        if (i >= FIR_ROWS || x < 0 || x >= size.width) continue;
         int tx = x / LAYERED_TILE;
-        int is_here = state[tx - tile0] & 2;
-        __local float *line = lines + 4 * LANES * b;
-        for (int i = 0; i < FIR_ROWS; i++, line += line_width * 4) {
-            floatn layer[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
-            if (is_here && y0 + i < size.height)
-                layered_block(layer, color, inv_depth, size, own, layer_peels[tx], x, y0 + i);
-#pragma unroll
-            for (int q = 0; q < 4; q++) store_lanes_local(line + LANES * q, layer[q]);
-        }
+        if (!(state[tx - tile0] & 2)) continue;
+        floatn layer[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
+        if (y0 + i < size.height) layered_block(layer, color, inv_depth, size, own, layer_peels[tx], x, y0 + i);
+        layered_put(lines + LANES * b * FIR_LINE + 4 * i, layer);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int b = lid; b < line_width / PIXELS; b += items) {
         int x = x0 - halo + PIXELS * b;
-        if (x < 0 || x >= size.width || !(state[x / LAYERED_TILE - tile0] & 1)) continue;
-        __local float *line = lines + LANES * b;
-        if (!step.in_front && layered_hides(line, line_width)) continue;
-        floatn acc[FIR_ROWS];
-        fir_columns(acc, image, x, y0, size.height, size.pitch, taps + step.taps_in, step.radius_in);
-        layered_add(line, line_width, acc, step.in_front);
+        if (x < 0 || x >= size.width) continue;
+        __local float *line = lines + PIXELS * b * FIR_LINE;
+        const int is_there = state[x / LAYERED_TILE - tile0];
+        if (is_there == 2 || (is_there == 3 && !step.in_front && layered_hides(line))) continue;
+        for (int row = 0; row < FIR_ROWS; row += FIR_RUN) {
+            floatn acc[FIR_RUN] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
+            if (is_there && y0 + row < size.height)
+                fir_columns(acc, image, x, y0 + row, size.height, size.pitch, taps + step.taps_in, step.radius_in);
+            layered_add(line + 4 * row, acc, is_there & 2, step.in_front);
+        }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     fir_extend_lines(lines, line_width, x0 - halo, size.width);
+    /* Tiles that the row filter reads; beyond the image's edges the edge tiles stand for the rest. */
+    for (int t = lid; t < segment_tiles; t += items) {
+        const int tile = x0 / LAYERED_TILE + t;
+        int any = 0;
+        for (int i = 0; i <= 2 * halo_tiles; i++) any |= state[t + i];
+        is_written[t] = any;
+        if (tile < size.tiles_x) reached_out[ty * size.tiles_x + tile] = any;
+    }
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    for (int b = lid; b < step.segment / (2 * PIXELS); b += items) {
-        int x = x0 + 2 * PIXELS * b;
+    for (int b = lid; b < step.segment / FIR_RUN * FIR_GROUPS; b += items) {
+        int j = b / FIR_GROUPS * FIR_RUN, x = x0 + j, row = b % FIR_GROUPS * PIXELS;
         if (x >= size.pitch) continue;
-        /* Tiles that this one's row filter reads; beyond the image's edges the edge tiles stand for the rest. */
-        int tile = x / LAYERED_TILE;
-        int any = 0;
-        for (int t = tile - halo_tiles; t <= tile + halo_tiles; t++) any |= state[t - tile0];
-        if (x % LAYERED_TILE == 0 && tile < size.tiles_x) reached_out[ty * size.tiles_x + tile] = any;
-        if (!any) {
-            for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
-                __global float *to = out + ((size_t)(y0 + i) * size.pitch + x) * 4;
-                store_lanes(to, (floatn)(0.0f));
-                store_lanes(to + LANES, (floatn)(0.0f));
-            }
-            continue;
+        if (is_written[j / LAYERED_TILE]) {
+            fir_store(out, lines + (j + halo) * FIR_LINE + 4 * row, x, y0 + row, size.height, size.pitch,
+                      taps + step.taps_out, step.radius_out);
+        } else {
+            for (int i = 0; i < PIXELS && y0 + row + i < size.height; i++)
+#pragma unroll
+                for (int c = 0; c < 4 * FIR_RUN; c += LANES)
+                    store_lanes(out + ((size_t)(y0 + row + i) * size.pitch + x) * 4 + c, (floatn)(0.0f));
         }
-        fir_store_pair(out, lines, line_width, 2 * PIXELS * b + halo, x, y0, size.height, size.pitch, taps + step.taps_out,
-                       step.radius_out);
     }
 }
 
@@ -425,7 +448,7 @@ typedef struct {
  *         color, inv_depth, tile_peels, taps, matting  as layered_step
  * writes  out  float[height - 2*guard][width - 2*guard][4]
  * range   2-D groups: one per tile; local size (any, 1)
- * local   lines  float[FIR_ROWS][LAYERED_TILE][4] */
+ * local   lines  float[LAYERED_TILE][FIR_LINE] */
 __kernel void layered_resolve(__global float *restrict out, const __global float *restrict front,
                               const __global int *restrict front_reached, const __global float *restrict back,
                               const __global int *restrict back_reached, const __global float *restrict color,
@@ -446,25 +469,36 @@ __kernel void layered_resolve(__global float *restrict out, const __global float
         floatn layer[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
         if (peels && x < size.width && y0 + i < size.height)
             layered_block(layer, color, inv_depth, size, own, peels, x, y0 + i);
-#pragma unroll
-        for (int q = 0; q < 4; q++) store_lanes_local(lines + 4 * LANES * b + LANES * q, layer[q]);
+        layered_put(lines + (x - x0) * FIR_LINE + 4 * i, layer);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int b = lid; b < LAYERED_TILE / PIXELS; b += items) {
         int x = x0 + PIXELS * b;
         if (x >= size.width) continue;
-        __local float *line = lines + LANES * b;
-        floatn acc[FIR_ROWS];
-        if (has_back && !layered_hides(line, LAYERED_TILE)) {
-            fir_columns(acc, back, x, y0, size.height, size.pitch, taps + resolve.taps_back, resolve.radius_back);
-            layered_add(line, LAYERED_TILE, acc, 0);
+        __local float *line = lines + PIXELS * b * FIR_LINE;
+        const int is_open = has_back && !layered_hides(line);
+        for (int row = 0; row < FIR_ROWS && y0 + row < size.height; row += FIR_RUN, line += 4 * FIR_RUN) {
+            floatn image[FIR_RUN], acc[FIR_RUN];
+#pragma unroll
+            for (int i = 0; i < FIR_RUN; i++) image[i] = load_lanes_local(line + fir_place(i));
+            fir_turn(image);
+            if (is_open) {
+                fir_columns(acc, back, x, y0 + row, size.height, size.pitch, taps + resolve.taps_back,
+                            resolve.radius_back);
+#pragma unroll
+                for (int i = 0; i < FIR_RUN; i++) image[i] = over(image[i], acc[i]);
+            }
+            if (has_front) {
+                fir_columns(acc, front, x, y0 + row, size.height, size.pitch, taps + resolve.taps_front,
+                            resolve.radius_front);
+#pragma unroll
+                for (int i = 0; i < FIR_RUN; i++) image[i] = over(acc[i], image[i]);
+            }
+#pragma unroll
+            for (int i = 0; i < FIR_RUN; i++)
+                if (y0 + row + i < size.height)
+                    layered_finish_pixels(out, image[i], size, resolve.guard, x, y0 + row + i);
         }
-        if (has_front) {
-            fir_columns(acc, front, x, y0, size.height, size.pitch, taps + resolve.taps_front, resolve.radius_front);
-            layered_add(line, LAYERED_TILE, acc, 1);
-        }
-        for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++)
-            layered_finish_pixels(out, load_lanes_local(line + i * LAYERED_TILE * 4), size, resolve.guard, x, y0 + i);
     }
 }
 
@@ -472,15 +506,17 @@ __kernel void layered_resolve(__global float *restrict out, const __global float
  * reads   image    float[height][pitch][4]  blurred along the rows, the column filter still owed
  *         taps     float[]
  * updates composed float[height][pitch][4]  written afresh when `first`
- * range   2-D, one item per PIXELS pixels of a row and block of FIR_ROWS rows, any local size */
+ * range   2-D, one item per PIXELS pixels of a row and FIR_RUN rows, any local size */
 __kernel void layered_under(__global float *restrict composed, const __global float *restrict image,
-                            const __global float *restrict taps, LayeredSize size, int first, int radius, int centre)
+                            const __global float *restrict taps, LayeredSize size, int first, int radius, int start)
 {
-    const int x = PIXELS * (int)get_global_id(0), y0 = FIR_ROWS * (int)get_global_id(1);
+    const int x = PIXELS * (int)get_global_id(0), y0 = FIR_RUN * (int)get_global_id(1);
     if (x >= size.width || y0 >= size.height) return;
-    floatn acc[FIR_ROWS];
-    fir_columns(acc, image, x, y0, size.height, size.pitch, taps + centre, radius);
-    for (int i = 0; i < FIR_ROWS && y0 + i < size.height; i++) {
+    floatn acc[FIR_RUN];
+    fir_columns(acc, image, x, y0, size.height, size.pitch, taps + start, radius);
+#pragma unroll
+    for (int i = 0; i < FIR_RUN; i++) {
+        if (y0 + i >= size.height) continue;
         __global float *to = composed + ((size_t)(y0 + i) * size.pitch + x) * 4;
         store_lanes(to, first ? acc[i] : over(load_lanes(to), acc[i]));
     }

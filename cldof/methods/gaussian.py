@@ -10,10 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FIR_PAD", "fir_radius", "fir_taps", "fir_variance", "iir_sections", "padded_taps"]
-
-# Zeros on both sides of the taps that kernels see; the constant of the same name in kernels/fir.clh.
-FIR_PAD = 8
+__all__ = ["fir_radius", "fir_taps", "fir_variance", "half_taps", "iir_sections"]
 
 # exp(-x^2 / 2) ~ sum of Re((a - ib) exp(-(l - iw) x)), rows (a, b, l, w): Deriche's form ("Recursively implementing the
 # Gaussian and its derivatives", INRIA 1893, 1993) with three terms, fitted minimax on 0..10; |error| <= 2e-6. Two terms
@@ -50,9 +47,9 @@ def fir_variance(taps: NDArray[np.float64]) -> float:
     return float((taps * np.arange(-radius, radius + 1) ** 2).sum())
 
 
-def padded_taps(taps: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Taps as kernels/fir.clh reads them: float32 with :data:`FIR_PAD` zeros on either side."""
-    return np.pad(taps, FIR_PAD).astype(np.float32)
+def half_taps(taps: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Symmetric taps as kernels/fir.clh reads them: float32, from the middle one outwards."""
+    return taps[len(taps) // 2 :].astype(np.float32)
 
 
 def iir_sections(sigma: float) -> NDArray[np.float32]:

@@ -43,9 +43,10 @@ from .base import Array, FrameShape, Locality, Plan, struct_scalar
 
 __all__ = ["MAX_LAYERS", "LayerStack", "Layered", "matting_functions"]
 
-# Constants of kernels/layered.cl.
+# Constants of kernels/layered.cl and fir.clh.
 MAX_LAYERS = 32
 _TILE = 64
+_FIR_RUN = 4
 
 # A side whose largest CoC radius (px) stays below this gets no layers: the largest change is then below 1e-5 of a pixel
 # value, since a Gaussian of sigma 5e-4 px keeps all but exp(-2e6) of a pixel in place.
@@ -110,26 +111,31 @@ class _Blocking:
     """How the FIR kernels cut an image into work-groups."""
 
     rows: int  # FIR_ROWS
-    group: int  # FIR_GROUP
+    gap: int  # FIR_GAP
     segment: int  # pixels of a row that a work-group owns, where local memory has room for them
     local_size: int
     largest_fir_sigma: float  # above it the recursive engine is faster
 
     @property
     def defines(self) -> tuple[tuple[str, int], ...]:
-        return (("FIR_ROWS", self.rows), ("FIR_GROUP", self.group))
+        return (("FIR_ROWS", self.rows), ("FIR_GAP", self.gap))
+
+    @property
+    def line_bytes(self) -> int:
+        """Of a pixel's column in the lines, FIR_LINE floats."""
+        return self.rows * 16 + self.gap * 4
 
     def segment_within(self, local_bytes: int, radius: int) -> int:
         """The longest segment, in whole tiles, whose lines fit with what a filter reads around them; 0 for none."""
         # A byte more a pixel is plenty for the words that layered_step keeps per tile.
-        room = (local_bytes - 64) // (self.rows * 16 + 1) - 2 * _halo(radius)
+        room = (local_bytes - 64) // (self.line_bytes + 1) - 2 * _halo(radius)
         return max(0, min(self.segment, room // _TILE * _TILE))
 
 
 # On a CPU one work-item owns a block of lines that stays in its L1/L2 cache. The values for GPUs are reasoned, not
 # measured: enough items per group to hide latency, accumulators that fit the registers.
-_CPU_BLOCKING = _Blocking(rows=8, group=4, segment=512, local_size=1, largest_fir_sigma=5.5)
-_GPU_BLOCKING = _Blocking(rows=4, group=2, segment=256, local_size=64, largest_fir_sigma=12.0)
+_CPU_BLOCKING = _Blocking(rows=8, gap=0, segment=512, local_size=1, largest_fir_sigma=5.5)
+_GPU_BLOCKING = _Blocking(rows=4, gap=4, segment=256, local_size=64, largest_fir_sigma=12.0)
 
 
 @dataclass(frozen=True)
@@ -369,18 +375,18 @@ class _Taps:
 
     def __init__(self) -> None:
         self._chunks: list[NDArray[np.float32]] = []
-        self._centres: dict[float, tuple[int, int]] = {}
-        self.centre(0.0)
+        self._starts: dict[float, tuple[int, int]] = {}
+        self.start(0.0)
 
-    def centre(self, sigma: float) -> tuple[int, int]:
-        """(radius, where the middle tap stands); sigma 0 is the identity."""
-        if sigma not in self._centres:
+    def start(self, sigma: float) -> tuple[int, int]:
+        """(radius, where the taps start); sigma 0 is the identity."""
+        if sigma not in self._starts:
             start = sum(map(len, self._chunks))
             taps = gaussian.fir_taps(sigma) if sigma > 0.0 else np.ones(1)
             radius = len(taps) // 2
-            self._chunks.append(gaussian.padded_taps(taps))
-            self._centres[sigma] = (radius, start + gaussian.FIR_PAD + radius)
-        return self._centres[sigma]
+            self._chunks.append(gaussian.half_taps(taps))
+            self._starts[sigma] = (radius, start)
+        return self._starts[sigma]
 
     def data(self) -> NDArray[np.float32]:
         return np.concatenate(self._chunks)
@@ -497,7 +503,7 @@ class _Builder:
         sigmas = GAUSSIAN_SIGMA * np.abs(layer_coc(self.stack))
         for layer in range(self.stack.total):
             image = self._step(f"{run}_layer_{layer}", layer, self.nothing, True, float(sigmas[layer]))
-            radius, centre = self.taps.centre(image.sigma)
+            radius, start = self.taps.start(image.sigma)
             self._add(
                 "layered_under",
                 (
@@ -507,9 +513,9 @@ class _Builder:
                     self.size,
                     np.int32(layer == 0),
                     np.int32(radius),
-                    np.int32(centre),
+                    np.int32(start),
                 ),
-                (-(-self.shape.width // self.pixels_a_vector), self.tiles_y),
+                (-(-self.shape.width // self.pixels_a_vector), -(-self.shape.height // _FIR_RUN)),
                 traffic_bytes=self.pixels * 16 * (2 if layer == 0 else 3),
             )
         self._add(
@@ -522,9 +528,9 @@ class _Builder:
     def _step(self, name: str, layer: int, image: _Image, in_front: bool, sigma: float) -> _Image:
         """Compose one layer with what there is and blur both."""
         recursive = self.engines.is_recursive(sigma)
-        radius_in, taps_in = self.taps.centre(image.sigma)
+        radius_in, taps_in = self.taps.start(image.sigma)
         row_sigma = 0.0 if recursive else sigma
-        radius_out, taps_out = self.taps.centre(row_sigma)
+        radius_out, taps_out = self.taps.start(row_sigma)
         reached = f"{name}_reached"
         self._image_buffer(name)
         self.buffers.append(Buffer(reached, self.tiles_x * self.tiles_y * 4))
@@ -550,8 +556,8 @@ class _Builder:
                 read("matting"),
                 self.size,
                 step,
-                Local(blocking.rows * (segment + 2 * _halo(radius_out)) * 16),
-                Local((segment // _TILE + 2 * halo_tiles) * 4),
+                Local(blocking.line_bytes * (segment + 2 * _halo(radius_out))),
+                Local((2 * (segment // _TILE) + 2 * halo_tiles) * 4),
             ),
             (groups[0] * self.local_size, groups[1]),
             (self.local_size, 1),
@@ -587,7 +593,7 @@ class _Builder:
         return _Image(names[2], "tile_peels", 2, 0.0)
 
     def _resolve(self, front: _Image, back: _Image) -> None:
-        ends = [(image.below, *self.taps.centre(image.sigma)) for image in (front, back)]
+        ends = [(image.below, *self.taps.start(image.sigma)) for image in (front, back)]
         resolve = struct_scalar(
             _RESOLVE,
             self.stack.front,
@@ -612,7 +618,7 @@ class _Builder:
                 read("matting"),
                 self.size,
                 resolve,
-                Local(self.blocking.rows * _TILE * 16),
+                Local(self.blocking.line_bytes * _TILE),
             ),
             (self.tiles_x * self.local_size, self.tiles_y),
             (self.local_size, 1),
@@ -649,4 +655,4 @@ class _Builder:
 
 def _halo(radius: int) -> int:
     """Pixels that a line block reaches beyond its segment; as in kernels/layered.cl."""
-    return (radius + 19) & ~15
+    return (radius + 15) & ~15

@@ -33,13 +33,13 @@ def blurred(device: Device, engine: str, image: np.ndarray, sigma: float) -> np.
     if engine == "fir":
         taps = gaussian.fir_taps(sigma)
         radius = len(taps) // 2
-        halo, segment = (radius + 7) & ~3, 64
+        halo, segment = (radius + 4) & ~3, 64
         local = 8 * (segment + 2 * halo) * 16
         if local > device.traits.local_mem_bytes:
             pytest.skip(f"sigma {sigma} needs {local} bytes of local memory, more than this device has")
         args = [
             padded(image, pitch),
-            gaussian.padded_taps(taps),
+            gaussian.half_taps(taps),
             *extent,
             np.int32(radius),
             np.int32(segment),

@@ -24,10 +24,10 @@ def fir(device: Device, image: np.ndarray, taps: np.ndarray, segment: int = 64) 
     height, width = image.shape[:2]
     pitch = row_pitch(width)
     radius = len(taps) // 2
-    halo = (radius + 7) & ~3
+    halo = (radius + 4) & ~3
     args = [
         padded(image, pitch),
-        gaussian.padded_taps(taps),
+        gaussian.half_taps(taps),
         *(np.int32(n) for n in (width, height, pitch, radius, segment)),
         Local(8 * (segment + 2 * halo) * 16),
     ]
