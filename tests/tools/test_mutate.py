@@ -22,13 +22,13 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
 @pytest.mark.parametrize(
     ("new", "verdict"),
     [
-        ("w = 2.0f / load_quad(depth);", "caught"),
-        ("w = 1.0f / (load_quad(depth));", "survived"),
+        ("w = 2.0f / load_lanes(depth);", "caught"),
+        ("w = 1.0f / (load_lanes(depth));", "survived"),
         ("w = 1.0f / nothing_of_that_name;", "broken"),
     ],
 )
 def test_a_mutant_meets_its_fate(workshop: Workshop, device_info: object, new: str, verdict: str) -> None:
-    mutant = Mutant("frame.clh", "w = 1.0f / load_quad(depth);", new, "weight")
+    mutant = Mutant("frame.clh", "w = 1.0f / load_lanes(depth);", new, "weight")
     before = (workshop.tree / "cldof" / "kernels" / "frame.clh").read_text()
     outcome = workshop.try_out(mutant, SUITE, 300.0)
     assert outcome.verdict == verdict, outcome.by
