@@ -425,7 +425,10 @@ __kernel void lightfield_slots(__global uint *restrict slot_at, __global uint *r
 #endif
             /* The void behind a surface is the same for every peel; what is behind glass at infinity is not void. */
             if (m > 0 && depth == 0.0f && inv_depth[row - peel + x] == 0.0f
-                && !(LIGHTFIELD_GLASS > 0 && is_glass(color, size, m - 1, x, y)))
+#if LIGHTFIELD_GLASS
+                && !is_glass(color, size, m - 1, x, y)
+#endif
+            )
                 continue;
             const float coc = ((const float *)&c)[i];
             const size_t to = row + count++;
@@ -1111,6 +1114,7 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
             if (!RAYS_OF(found, hits, 0))
                 for (int i = 0; i < end; i++) hits[i] = (uint2)(NONE);
             for (int p = 1; p < size.planes; p++) has_pane[p] = RAYS_OF(panes[p], pane_hits[p], p);
+            const float behind_glass = LIGHTFIELD_VOID ? 0.0f : MAXFLOAT; /* how opaque glass is before a hole that counts */
             for (int i = 0; i < end; i++) {
                 const int is_hole = hits[i].x == NONE;
                 uint2 last = (uint2)(0);
@@ -1126,7 +1130,7 @@ __kernel void lightfield_synthesize(__global float *restrict out, __global float
                     last = pane_hits[next][i];
                     ray += (1.0f - ray.w) * panes[next][i];
                 }
-                weights[b + i] += !is_hole || (LIGHTFIELD_VOID != 0 && ray.w > 0.0f) ? weight : weight * ray.w;
+                weights[b + i] += !is_hole || ray.w > behind_glass ? weight : weight * ray.w;
                 if (!is_hole) ray += (1.0f - ray.w) * found[i];
                 total[b + i] += weight * ray;
             }
