@@ -52,7 +52,15 @@ WIDEST_BYTES = 32
 """What a call out of a program may pass or return at most in one vector."""
 
 _NAMES = ("clang", *(f"clang-{version}" for version in range(21, 13, -1)))
-_LANGUAGE = ("-x", "cl", "-cl-std=CL1.2", "-Werror", "-ferror-limit=3")
+_LANGUAGE = (
+    "-x",
+    "cl",
+    "-cl-std=CL1.2",
+    "-Xclang",
+    "-cl-ext=+cl_khr_int64_extended_atomics",
+    "-Werror",
+    "-ferror-limit=3",
+)
 _TRIVIAL = "__kernel void trivial(__global float *o) { o[get_global_id(0)] = 1.0f; }\n"
 
 
