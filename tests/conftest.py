@@ -25,7 +25,7 @@ from cldof.host.caches import prepare_environment, user_cache_dir
 from cldof.host.device import Device, DeviceInfo, list_devices
 from cldof.host.trial import SWITCH
 from tests.limits import limit_devices
-from tests.shared_builds import share_builds
+from tests.sharing import share_builds, share_scenes
 
 _REPOSITORY = Path(__file__).parents[1]
 
@@ -75,6 +75,11 @@ _PARAMS = [pytest.param(info, id=f"{info.index}-{info.name.split('-')[0].replace
 
 limit_devices()
 share_builds()
+
+
+def pytest_collection_finish() -> None:
+    """Now it is known whether tests need scenes."""
+    share_scenes()
 
 
 class CanaryPool(BufferPool):

@@ -55,7 +55,7 @@ def test_complete_and_not_too_heavy(named_scene: tuple[str, Scene]) -> None:
 
 
 def test_same_every_time() -> None:
-    first, second = build("foliage"), builtin_scene("foliage")
+    first, second = build("foliage"), builtin_scenes()["foliage"].make.__wrapped__()  # type: ignore[attr-defined]
     assert len(first.nodes) == len(second.nodes)
     for a, b in zip(first.nodes, second.nodes, strict=True):
         assert np.array_equal(a.mesh.vertices, b.mesh.vertices)
@@ -141,7 +141,7 @@ def test_flat_is_all_in_focus(peeler: DepthPeeler) -> None:
 
 @pytest.mark.parametrize("name", ["silhouettes", "sky"])
 def test_hard_scenes_are_the_same_every_time(name: str) -> None:
-    first, second = build(name), builtin_scene(name)
+    first, second = build(name), builtin_scenes()[name].make.__wrapped__()  # type: ignore[attr-defined]
     for a, b in zip(first.nodes, second.nodes, strict=True):
         assert np.array_equal(a.mesh.vertices, b.mesh.vertices)
 

@@ -1,11 +1,14 @@
-"""One OpenCL context a device, and each program built once, for all that a test process opens.
+"""What the tests of one process make once: OpenCL contexts, built programs, and built-in scenes.
 
-Tests open a device some hundred times, and each would build the same few programs again: even from the driver's cache
-that is 0.04 s a program. Queues, pools and kernels stay each device's own, and children of tests share nothing.
+Tests open devices some hundred times, and each would build the same few programs again: even from the driver's cache
+that is 0.04 s a program. Queues, pools and kernels stay each device's own. Scenes are immutable, and take a second each
+to make. Children of tests share nothing.
 """
 
 from __future__ import annotations
 
+import sys
+from functools import cache
 from typing import Any
 
 from cldof.host import device as device_module
@@ -13,7 +16,7 @@ from cldof.host import opencl as cl
 from cldof.host.device import Device, DeviceInfo
 from cldof.host.program import ProgramCache
 
-__all__ = ["share_builds"]
+__all__ = ["share_builds", "share_scenes"]
 
 
 def share_builds() -> None:
@@ -51,3 +54,13 @@ def share_builds() -> None:
     device_module._open = open_shared
     ProgramCache._build = program  # type: ignore[method-assign]
     Device._probe = probe  # type: ignore[method-assign]
+
+
+def share_scenes() -> None:
+    """From here on each built-in scene is made once, if tests need any; ``make.__wrapped__`` makes another."""
+    scenes = sys.modules.get("cldof.capture.scenes")
+    if scenes is None:
+        return
+    listed: Any = scenes.BuiltinScene
+    once = cache(cache)  # one cache for each function
+    scenes.BuiltinScene = lambda description, make, *group: listed(description, once(make), *group)
