@@ -11,7 +11,7 @@ export PYTHON
 
 help:
 	@echo "make demo   render a built-in scene to out/demo.png (and out/demo-pinhole.png beside it)"
-	@echo "make test   run all tests          (ARGS='-k lens' picks some)"
+	@echo "make test   run all tests          (ARGS='-k lens' picks some, ARGS='-n 0' has one process run them)"
 	@echo "make stability  hard cases on every device, measured into docs/stability.md"
 	@echo "make test-install   wheel and sdist in clean environments, and what they require on four systems (3 minutes)"
 	@echo "make test-devices   the kernel and method tests on every OpenCL driver that can be installed, and how they agree"
@@ -31,9 +31,11 @@ demo:
 	@$(VENV)/cldof render foliage -o out/demo.png --pinhole out/demo-pinhole.png --size 1024x768 --supersample 2 \
 		$(if $(DEVICE),--device "$(DEVICE)")
 
+# A process for each core, as builds and references keep one core busy each; few, as each of them builds and kernels run
+# on all cores anyway (tests/workers.py).
 test:
 	@scripts/setup.sh test
-	$(VENV)/python -m pytest $(ARGS)
+	$(VENV)/python -m pytest -n auto --maxprocesses 4 $(ARGS)
 
 # What hard cases measure on every device of this machine, and the page of it.
 stability:

@@ -19,9 +19,9 @@ import pytest
 from hypothesis.database import DirectoryBasedExampleDatabase
 
 from cldof.errors import DeviceError
+from cldof.host import caches
 from cldof.host import opencl as cl
 from cldof.host.buffers import BufferPool
-from cldof.host.caches import prepare_environment, user_cache_dir
 from cldof.host.device import Device, DeviceInfo, list_devices
 from cldof.host.trial import SWITCH
 from tests.limits import limit_devices
@@ -47,8 +47,9 @@ UNWRITTEN = 0xFF  # NaN as float32, -1 as int32
 
 # Before anything imports pyopencl: a cache that later runs find again, where each process at a time has a directory of
 # its own. The variables also reach subprocesses.
-os.environ["POCL_CACHE_DIR"] = os.environ.get("POCL_CACHE_DIR") or str(user_cache_dir() / "cldof-tests")
-prepare_environment()
+_CACHE = os.environ.get("POCL_CACHE_DIR") or str(caches.user_cache_dir() / "cldof-tests")
+os.environ["POCL_CACHE_DIR"] = _CACHE
+caches.prepare_environment()
 os.environ["CLDOF_CACHE_DIR"] = str(Path(os.environ["POCL_CACHE_DIR"]) / "cldof")
 # Tests build hundreds of kinds of frames, each once: trying them in children would take a second each. Those of trials
 # turn them on.
@@ -75,6 +76,22 @@ _PARAMS = [pytest.param(info, id=f"{info.index}-{info.name.split('-')[0].replace
 
 limit_devices()
 share_builds()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """A process that hands out tests to others (``pytest -n 2``) builds nothing: its folder is for one of them."""
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        if lock := caches._claimed.pop(caches.own_programs(), None):
+            lock.close()
+        os.environ["POCL_CACHE_DIR"] = _CACHE
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """What goes to which process."""
+    from tests.workers import ByMethod
+
+    return ByMethod(config, log)
 
 
 def pytest_collection_finish() -> None:
