@@ -611,11 +611,8 @@ class _Planner:
         low = stats.low.min(axis=0)
         is_gap = ~stats.is_closed[0] & (self.shape.has_glass | ~stats.is_closed.any(axis=0))
         low = np.where(is_gap[..., None], 0.0, low)
-        difference = np.zeros(stats.tiles)
-        for channel in range(4):
-            most, least = _spread(high[..., channel], radius), -_spread(-low[..., channel], radius)
-            difference = np.maximum(difference, most - least)
-        return difference
+        most, least_below = np.split(_spread(np.moveaxis(np.concatenate((high, -low), axis=-1), -1, 0), radius), 2)
+        return np.asarray(np.maximum(most + least_below, 0.0).max(axis=0), np.float64)
 
     def _may_cut(self, windows: tuple[Window, ...]) -> bool:
         """Whether nothing has to be guessed near the windows."""
@@ -991,23 +988,22 @@ def _tiles_of(window: Window) -> tuple[slice, slice]:
 
 
 def _spread(values: NDArray[Any], radius: int) -> NDArray[np.float64]:
-    """Maximum over a square of so many tiles on each side."""
+    """Maximum over a square of so many tiles on each side, (..., ty, tx)."""
     result = np.asarray(values, np.float64)
-    for axis in (0, 1):
-        count = result.shape[axis]
+    for _ in ("columns", "rows"):
+        count = result.shape[-2]
         reach = min(radius, count - 1)
-        if reach <= 0:
-            continue
-        pad = [(0, 0), (0, 0)]
-        pad[axis] = (reach, reach)
-        lines = np.moveaxis(np.pad(result, pad, constant_values=-np.inf), axis, 0)
-        window, size = lines, 1
-        while 2 * size <= 2 * reach + 1:
-            window = np.maximum(window[:-size], window[size:])
-            size *= 2
-        rest = 2 * reach + 1 - size
-        result = np.moveaxis(np.maximum(window[:count], window[rest : rest + count]), 0, axis)
-    return result
+        if reach > 0:
+            window = np.full((*result.shape[:-2], count + 2 * reach, result.shape[-1]), -np.inf)
+            window[..., reach : reach + count, :] = result
+            size = 1
+            while 2 * size <= 2 * reach + 1:
+                window = np.maximum(window[..., :-size, :], window[..., size:, :])
+                size *= 2
+            rest = 2 * reach + 1 - size
+            result = np.maximum(window[..., :count, :], window[..., rest : rest + count, :])
+        result = result.swapaxes(-1, -2)
+    return np.ascontiguousarray(result)
 
 
 def _boxes(active: NDArray[np.bool_], most: int, gap: int) -> list[tuple[int, int, int, int]]:
