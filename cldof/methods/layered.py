@@ -292,6 +292,7 @@ def _side_coc(last: int, step: float) -> tuple[float, ...]:
     return tuple(math.sqrt(total) / GAUSSIAN_SIGMA for total in np.cumsum(variances).tolist())
 
 
+@lru_cache(maxsize=1024)
 def _variance(sigma: float) -> float:
     """Variance that a step adds. Cut off and sampled taps have less than sigma^2, and the layers' CoC follow that."""
     if sigma <= _LARGE_SIGMA:
