@@ -3,7 +3,8 @@
 #
 # DEVICE is an index or part of a name of `cldof devices`; the first GPU by default. Needs the GPU's OpenCL driver, and a
 # CPU driver for the pictures to compare with (PoCL, which pip brings). Parts, each in a process of its own that is ended
-# when its time is up; what a part leaves of its seconds goes to those after it:
+# when its time is up; what a part leaves of its seconds goes to those after it, and what is left out gives its own (so
+# `--parts forms` compares as many as 7 minutes allow):
 #   doctor  60 s   `cldof doctor --json`
 #   forms  115 s   the 90 forms of tests/every_kernel.py against the CPU's pictures, at least 70 dB
 #   speed  110 s   `bench speed` of every method at 1080p and 4K, as ratios to OpenCV's Gaussian blur of sigma 16
@@ -40,6 +41,8 @@ if [ ! -x "$python" ]; then
     scripts/setup.sh test
 fi
 
+started=$(date +%s)
+
 # Containers get a GPU's driver mounted without the file by which OpenCL finds it.
 nvidia=libnvidia-opencl.so.1
 vendors=${OCL_ICD_VENDORS:-/etc/OpenCL/vendors}
@@ -54,4 +57,4 @@ fi
 
 # Where the tests keep what PoCL has built.
 export POCL_CACHE_DIR=${POCL_CACHE_DIR:-${XDG_CACHE_HOME:-$HOME/.cache}/cldof-tests}
-PYTHONPATH=$PWD "$python" -m tests.tools.gpu_check "$@"
+PYTHONPATH=$PWD "$python" -m tests.tools.gpu_check --started "$started" "$@"

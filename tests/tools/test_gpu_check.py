@@ -21,7 +21,7 @@ CPU = DeviceInfo(0, "pthread-cpu", "Portable Computing Language", "3.0", "cpu", 
 GPU = DeviceInfo(1, "NVIDIA H200 (PCIe)", "NVIDIA CUDA", "550", "gpu", 132, 1 << 37)
 
 
-def test_a_process_over_its_time_is_cut_with_all_its_children(tmp_path: Path) -> None:
+def test_a_process_over_its_time_is_cut_with_all_its_children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also one that does not notice an interrupt; what it printed is there."""
     code = (
         "import signal, subprocess, sys, time\n"
@@ -30,10 +30,11 @@ def test_a_process_over_its_time_is_cut_with_all_its_children(tmp_path: Path) ->
         "print('child', child.pid, flush=True)\n"
         "time.sleep(60)\n"
     )
+    monkeypatch.setattr(gpu_check, "_GRACE_S", 0.5)
     begin = time.monotonic()
-    done = run_process([sys.executable, "-c", code], 1.5, tmp_path / "log")
+    done = run_process([sys.executable, "-I", "-S", "-c", code], 5.0, tmp_path / "log")
     assert done.cut
-    assert time.monotonic() - begin < 20.0
+    assert time.monotonic() - begin < 40.0  # it would take 60
     child = int(done.text.split()[1])
     for _ in range(50):  # init reaps it
         state = Path(f"/proc/{child}/stat")
@@ -194,6 +195,16 @@ def test_the_exit_code_says_whether_anything_failed(
     last = capsys.readouterr().out.splitlines()[-2]
     assert last.startswith("PASS" if passed else "FAIL")
     assert ("not all of it ran" in last) == (not complete)
+
+
+def test_time_that_went_before_the_start_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CLDOF_TEST_LIMITS", raising=False)
+    budgets = fake(monkeypatch, {"forms": "passed"})
+    monkeypatch.setattr(gpu_check.time, "time", lambda: 1030.0)
+    path = tmp_path / "result.json"
+    assert gpu_check.main(["--output", str(path), "--started", "1000"]) == 0
+    assert budgets["forms"] == 480.0 - 25.0 - 30.0
+    assert json.loads(path.read_text())["seconds"] == 40.0
 
 
 def test_a_cpu_told_to_be_a_gpu_is_no_gpu(
