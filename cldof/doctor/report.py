@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
@@ -68,6 +69,7 @@ class Report:
     findings : list of Finding
     devices : list of dict
         As :class:`cldof.host.device.DeviceInfo`, and ``methods``: by name ``db`` and ``seconds``, or ``error``.
+        ``db`` is infinite where the bits are those expected, and minus infinity where an image is not one to compare.
     """
 
     version: str = __version__
@@ -80,8 +82,13 @@ class Report:
         return any(_is_right(result) for device in self.devices for result in device["methods"].values())
 
     def as_json(self) -> str:
-        """For reports; infinite dB, the same bits, are the string ``"same"``."""
-        return json.dumps({"can_render": self.can_render, **asdict(self)}, indent=2)
+        """For reports. Infinite dB, for which JSON has no number, are ``"same"`` and ``"not comparable"``."""
+        whole = {"can_render": self.can_render, **asdict(self)}
+        for device in whole["devices"]:
+            for result in device["methods"].values():
+                if math.isinf(result.get("db", 0.0)):
+                    result["db"] = "same" if result["db"] > 0 else "not comparable"
+        return json.dumps(whole, indent=2, allow_nan=False)
 
 
 def examine(progress: Progress = lambda what: None, device: int | None = None) -> Report:
@@ -218,6 +225,9 @@ def _at_work(device: dict[str, Any], progress: Progress) -> dict[str, Any]:
         _, died = _ask(["device", str(device["index"]), *left], look)
         if died or at not in results:
             results.setdefault(at, {"error": died or "no answer"})
+        for result in results.values():
+            if "error" in result:
+                result["error"] = _without_source(result["error"])
         left = [name for name in left if name not in results] if died else []
     return results
 
@@ -238,9 +248,16 @@ def _judged(device: dict[str, Any]) -> Finding:
     return Finding(what, "note" if len(wrong) < len(device["methods"]) else "bad", f"{found}: {reasons}", advice)
 
 
+def _without_source(error: str) -> str:
+    """A build's error without the program's text, which whoever reads a report has."""
+    before, _, rest = error.partition("--- source\n")
+    _, mark, log = rest.partition("--- compiler log\n")
+    return f"{before}{mark}{log}".rstrip()
+
+
 def first_words(error: str) -> str:
     """An error in a line; reports have all of it."""
-    line = " ".join(error.partition("--- source")[0].split())
+    line = " ".join(error.split())
     return line if len(line) <= _LONGEST else f"{line[:_LONGEST]} ..."
 
 
@@ -256,18 +273,26 @@ def _ask(words: Sequence[str], look: Callable[[dict[str, Any]], None] = lambda l
         command = [sys.executable, "-m", "cldof.doctor.probe", *words]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, env=environment) as child:
             assert child.stdout is not None
+            limit = threading.Timer(_LIMIT_S, child.kill)
+            limit.daemon = True
+            limit.start()
             try:
                 for text in child.stdout:
                     lines.append(json.loads(text))
                     look(lines[-1])
-                code = child.wait(_LIMIT_S)
+                code = child.wait()
             except BaseException:
                 child.kill()
                 raise
+            finally:
+                is_late = not limit.is_alive()
+                limit.cancel()
         errors.seek(0)
         said = errors.read().decode(errors="replace").strip().splitlines()
     if code in (0, 2):
         return lines, ""
+    if is_late:
+        return lines, f"no answer within {_LIMIT_S} s"
     return lines, f"the process died with {_how(code)}{f': {said[-1]}' if said else ''}"
 
 
