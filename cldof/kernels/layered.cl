@@ -17,6 +17,12 @@
 
 #define LAYERED_MAX_LAYERS 32
 #define LAYERED_TILE 64
+/* Pixels of a row whose matting an item works out at a time, LANES to LAYERED_TILE. More than LANES takes an array that
+ * CPUs keep in their first cache and GPUs do not keep in registers. */
+#ifndef LAYERED_SPAN
+#define LAYERED_SPAN LANES
+#endif
+#define LAYERED_BLOCKS (LAYERED_SPAN / LANES)
 /* Below this coverage nothing is known about a pixel, and the result is exactly 0. */
 #define LAYERED_MIN_COVERAGE 1e-4f
 
@@ -24,7 +30,7 @@
 #ifndef LAYERED_VOID
 #define LAYERED_VOID 0
 #endif
-/* 1: carry the surfaces' alpha in channel 0 in place of colour. */
+/* 1: carry the surfaces' alpha in channel 0 in place of colour; only with LAYERED_VOID. */
 #ifndef LAYERED_ALPHA_RUN
 #define LAYERED_ALPHA_RUN 0
 #endif
@@ -138,20 +144,20 @@ static inline floatn layered_weight(const __global float *inv_depth, const __glo
     return w < 0.0f ? zero : up * down;
 }
 
-/* PIXELS slots of a peel as the current run composes them. */
-static inline floatn layered_color(floatn c, floatp w, int is_last)
+#if LAYERED_VOID
+/* PIXELS slots of a peel as the current run composes them. The void behind the last slot stands at its depth, that of an
+ * empty slot at infinity. */
+static inline floatn layered_void(floatn c, floatp w, int is_last)
 {
 #if LAYERED_ALPHA_RUN
     c = c.ALPHAS * every_pixel((float4)(1.0f, 0.0f, 0.0f, 0.0f)) + c * every_pixel((float4)(0.0f, 0.0f, 0.0f, 1.0f));
 #endif
-#if LAYERED_VOID
-    /* The void behind the last slot stands at its depth, that of an empty slot at infinity. */
     floatp a = c.ALPHA;
     a = w == 0.0f && a == 0.0f ? (floatp)(1.0f) : a;
     c.ALPHA = is_last ? (floatp)(1.0f) : a;
-#endif
     return c;
 }
+#endif
 
 #if LAYERED_GLASS
 /* Weights of PIXELS slots that are not opaque. An opaque slot may stand in several layers at full weight, since more of
@@ -171,54 +177,94 @@ static inline floatp layered_glass(floatp weight, floatp alpha, floatp w, floatp
 }
 #endif
 
-/* One layer (eq. 2) at the LANES pixels from x on, a multiple of LANES: weighted slots, composed front to back.
- * `peels` has a bit for each peel that brings something to this tile. */
-static inline void layered_block(floatn quad[4], const __global float *color, const __global float *inv_depth,
-                                 LayeredSize size, LayeredLayer layer, uint peels, int x, int y)
+/* One layer (eq. 2) at LAYERED_SPAN pixels from x on, a multiple of that, as far as `open` has a bit for the block of
+ * LANES: weighted slots, composed front to back. `peels` has a bit for each peel that brings something to this tile.
+ *
+ * A peel's weights come before its colours. What to load is known by then, and loads that wait for memory go on side by
+ * side, where a block at a time would begin with each when the one before is decided. */
+static inline void layered_span(floatn quad[LAYERED_BLOCKS][4], const __global float *color,
+                                const __global float *inv_depth, LayeredSize size, LayeredLayer layer, uint peels,
+                                uint open, int x, int y)
 {
-    for (int m = 0; m < size.peels; m++) {
+    for (int b = 0; b < LAYERED_BLOCKS; b++)
+#pragma unroll
+        for (int q = 0; q < 4; q++) quad[b][q] = (floatn)(0.0f);
+    for (int m = 0; m < size.peels && open; m++) {
         if (!(peels >> m & 1u)) continue;
         const size_t row = (size_t)m * size.height + y;
         const __global float *inv = inv_depth + row * size.pitch + x;
-        floatn w = load_lanes(inv);
-        floatn before = m > 0 ? load_lanes(inv - (size_t)size.height * size.pitch) : w;
-        /* Slots between that hold nothing do not count. */
-        for (int p = 2; p <= m; p++) {
-            const intn is_past_nothing = (before < 0.0f) & (w >= 0.0f);
-            if (!any_lane(is_past_nothing)) break;
-            before = is_past_nothing ? load_lanes(inv - (size_t)p * size.height * size.pitch) : before;
-        }
-        floatn weight = layered_weight(inv_depth, inv, w, before, layer, m, size, x, y);
-        if (!any_lane(weight > 0.0f)) continue;
-        const __global float *rgba = color + (row * size.width + x) * 4;
-        floatp weights[4] = FOUR_PARTS(weight);
-        const floatp inverse[4] = FOUR_PARTS(w);
+        floatn weight[LAYERED_BLOCKS];
 #if LAYERED_GLASS
-        const floatp inverse_before[4] = FOUR_PARTS(before);
+        floatn in_front[LAYERED_BLOCKS];
+#endif
+        uint brought = 0;
+        for (int b = 0; b < LAYERED_BLOCKS; b++) {
+            if (!(open >> b & 1u)) continue;
+            const __global float *at = inv + LANES * b;
+            const floatn w = load_lanes(at);
+            floatn before = m > 0 ? load_lanes(at - (size_t)size.height * size.pitch) : w;
+            /* Slots between that hold nothing do not count. */
+            for (int p = 2; p <= m; p++) {
+                const intn is_past_nothing = (before < 0.0f) & (w >= 0.0f);
+                if (!any_lane(is_past_nothing)) break;
+                before = is_past_nothing ? load_lanes(at - (size_t)p * size.height * size.pitch) : before;
+            }
+            weight[b] = layered_weight(inv_depth, at, w, before, layer, m, size, x + LANES * b, y);
+#if LAYERED_GLASS
+            in_front[b] = before;
+#endif
+            brought |= any_lane(weight[b] > 0.0f) ? 1u << b : 0u;
+        }
+        for (int b = 0; b < LAYERED_BLOCKS; b++) {
+            if (!(brought >> b & 1u)) continue;
+            const __global float *rgba = color + (row * size.width + x + LANES * b) * 4;
+            floatp weights[4] = FOUR_PARTS(weight[b]);
+#if LAYERED_VOID || LAYERED_GLASS
+            const floatn w = load_lanes(inv + LANES * b);
+            const floatp inverse[4] = FOUR_PARTS(w);
+#endif
+#if LAYERED_GLASS
+            const floatp inverse_before[4] = FOUR_PARTS(in_front[b]);
 #endif
 #pragma unroll
-        for (int q = 0; q < 4; q++) {
-            int valid = size.width - x - PIXELS * q;
-            if (valid <= 0) continue;
-            floatn c = load_pixels(rgba + LANES * q, valid);
-            c = layered_color(c, inverse[q], m == size.peels - 1);
-#if LAYERED_GLASS
-            weights[q] = layered_glass(weights[q], c.ALPHA, inverse[q], inverse_before[q], layer, m);
+            for (int q = 0; q < 4; q++) {
+                int valid = size.width - x - LANES * b - PIXELS * q;
+                if (valid <= 0) continue;
+                floatn c = load_pixels(rgba + LANES * q, valid);
+#if LAYERED_VOID
+                c = layered_void(c, inverse[q], m == size.peels - 1);
 #endif
-            quad[q] = over(quad[q], c * spread(weights[q]));
+#if LAYERED_GLASS
+                weights[q] = layered_glass(weights[q], c.ALPHA, inverse[q], inverse_before[q], layer, m);
+#endif
+                quad[b][q] = over(quad[b][q], c * spread(weights[q]));
+            }
+            /* Nothing shows through opaque pixels: no need to read the peels behind them. */
+            const floatn least = lesser(lesser(quad[b][0], quad[b][1]), lesser(quad[b][2], quad[b][3]));
+            open &= any_lane(least.ALPHAS < 1.0f) ? ~0u : ~(1u << b);
         }
-        /* Nothing shows through opaque pixels: no need to read the peels behind them. */
-        if (!any_lane(lesser(lesser(quad[0], quad[1]), lesser(quad[2], quad[3])).ALPHAS < 1.0f)) break;
     }
 }
 
-/* Put the LANES pixels of a row into lines; `line` is where the first one goes. */
-static inline void layered_put(__local float *line, const floatn quad[4])
+/* Put the blocks of a span that `within` has bits for into lines; `line` is where its first pixel goes, or would go. */
+static inline void layered_put(__local float *line, floatn quad[LAYERED_BLOCKS][4], uint within)
 {
+    for (int b = 0; b < LAYERED_BLOCKS; b++) {
+        if (!(within >> b & 1u)) continue;
 #pragma unroll
-    for (int q = 0; q < 4; q++)
+        for (int q = 0; q < 4; q++)
 #pragma unroll
-        for (int i = 0; i < PIXELS; i++) store_pixel_local(line + (PIXELS * q + i) * FIR_LINE, pixel_of(quad[q], i));
+            for (int i = 0; i < PIXELS; i++)
+                store_pixel_local(line + (LANES * b + PIXELS * q + i) * FIR_LINE, pixel_of(quad[b][q], i));
+    }
+}
+
+/* Bits for the blocks of the span at x that begin at `first` or behind it and before `end`. */
+static inline uint layered_within(int x, int first, int end)
+{
+    uint within = 0;
+    for (int b = 0; b < LAYERED_BLOCKS; b++) within |= x + LANES * b >= first && x + LANES * b < end ? 1u << b : 0u;
+    return within;
 }
 
 /* Whether the PIXELS pixels at `line` are opaque in all rows: then there is no point in filtering what lies behind. */
@@ -353,16 +399,17 @@ __kernel void layered_step(__global float *restrict out, __global int *restrict 
 
     /* The layer by itself first, then what is composed so far: loops that mix both run at half the speed on CPUs. Rows are
      * the outer loop, for the sake of what CPUs load ahead. */
-    const int blocks = line_width / LANES;
+    const int line_x0 = x0 - halo > 0 ? x0 - halo : 0;
+    const int line_x1 = x0 + step.segment + halo < size.width ? x0 + step.segment + halo : size.width;
+    const int span0 = line_x0 / LAYERED_SPAN, spans = (line_x1 + LAYERED_SPAN - 1) / LAYERED_SPAN - span0;
     for (int b = lid, i = 0; i < FIR_ROWS; b += items) {
-        for (; b >= blocks; b -= blocks) i++;
-        int x = x0 - halo + LANES * b;
-        if (i >= FIR_ROWS || x < 0 || x >= size.width) continue;
-        int tx = x / LAYERED_TILE;
-        if (!(state[tx - tile0] & 2)) continue;
-        floatn layer[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
-        if (y0 + i < size.height) layered_block(layer, color, inv_depth, size, own, layer_peels[tx], x, y0 + i);
-        layered_put(lines + LANES * b * FIR_LINE + 4 * i, layer);
+        for (; b >= spans; b -= spans) i++;
+        const int x = (span0 + b) * LAYERED_SPAN, tx = x / LAYERED_TILE;
+        if (i >= FIR_ROWS || !(state[tx - tile0] & 2)) continue;
+        const uint within = layered_within(x, line_x0, line_x1);
+        floatn layer[LAYERED_BLOCKS][4];
+        layered_span(layer, color, inv_depth, size, own, layer_peels[tx], y0 + i < size.height ? within : 0u, x, y0 + i);
+        layered_put(lines + (x - x0 + halo) * FIR_LINE + 4 * i, layer, within);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int b = lid; b < line_width / PIXELS; b += items) {
@@ -464,12 +511,12 @@ __kernel void layered_resolve(__global float *restrict out, const __global float
     const int has_front = layered_is_reached(front_reached, resolve.front, tx, ty, resolve.radius_front, size);
     const int has_back = layered_is_reached(back_reached, resolve.back, tx, ty, resolve.radius_back, size);
 
-    for (int b = lid; b < FIR_ROWS * LAYERED_TILE / LANES; b += items) {
-        int x = x0 + b % (LAYERED_TILE / LANES) * LANES, i = b / (LAYERED_TILE / LANES);
-        floatn layer[4] = {(floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f), (floatn)(0.0f)};
-        if (peels && x < size.width && y0 + i < size.height)
-            layered_block(layer, color, inv_depth, size, own, peels, x, y0 + i);
-        layered_put(lines + (x - x0) * FIR_LINE + 4 * i, layer);
+    for (int b = lid; b < FIR_ROWS * LAYERED_TILE / LAYERED_SPAN; b += items) {
+        int x = x0 + b % (LAYERED_TILE / LAYERED_SPAN) * LAYERED_SPAN, i = b / (LAYERED_TILE / LAYERED_SPAN);
+        const uint within = layered_within(x, x0, size.width);
+        floatn layer[LAYERED_BLOCKS][4];
+        layered_span(layer, color, inv_depth, size, own, peels, y0 + i < size.height ? within : 0u, x, y0 + i);
+        layered_put(lines + (x - x0) * FIR_LINE + 4 * i, layer, within);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int b = lid; b < LAYERED_TILE / PIXELS; b += items) {
