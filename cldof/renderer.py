@@ -609,7 +609,7 @@ class Renderer:
         preparation = self._free_preparation(shape, frames)
         if preparation is None:
             program = _preparation_program(shape, self.device.traits.is_cpu, self._planned)
-            preparation = compile(program, self.device, stats_params(frame) if self._planned else {})
+            preparation = compile(program, self.device, stats_params(frame) if self._planned else {}, more=True)
         pool = self.device.pool
         color, depth = pool.to_device(frame.color, "upload color"), pool.to_device(frame.depth, "upload depth")
         submission = preparation.submit(

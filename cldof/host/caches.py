@@ -2,8 +2,9 @@
 
 PoCL 3.0 trusts its cache. A program over which the compiler died stays there, and all later processes take it for one
 without kernels and end in turn, by abort(). So every process of ours has a folder of its own below the one that PoCL
-would use, nothing comes into it but by processes that ended well (:mod:`cldof.host.trial`), what one that was killed
-may have left is removed before it is read, and a folder that holds such a program is made anew by the next process.
+would use, nothing comes into it but what another process built and ran without dying (:mod:`cldof.host.trial`), what
+one that was killed may have left is removed before it is read, and a folder that holds such a program is made anew by
+the next process.
 """
 
 from __future__ import annotations
@@ -87,31 +88,23 @@ def own_programs() -> Path:
 
 @contextmanager
 def lent_programs() -> Iterator[Path]:
-    """A folder that another process may use as PoCL's; it begins with what this process has, and is removed after."""
+    """An empty folder that another process may use as PoCL's, removed after.
+
+    To have it begin with what this process has took longer than to build some of it again.
+    """
     scratch = Path(tempfile.mkdtemp(prefix=_LENT, dir=own_programs()))
     try:
-        _link_programs(own_programs(), scratch / _OWN)
         yield scratch
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
 def adopt_programs(lent: Path) -> None:
-    """Take over what was built in such a folder."""
-    _link_programs(lent / _OWN, own_programs())
-
-
-def give_up_programs() -> None:
-    """Have the next process begin with an empty folder: this one holds a program that cannot be read."""
-    with suppress(OSError):
-        (own_programs() / _DAMAGED).touch()
-
-
-def _link_programs(source: Path, target: Path) -> None:
-    """Links to the files of PoCL's programs in one folder from another, where they are not there yet.
+    """Take over what was built in such a folder, where it is not there yet.
 
     Best effort: what is missing is built again.
     """
+    source, target = lent / _OWN, own_programs()
     for program in source.glob(_PROGRAMS):
         for folder, _, names in os.walk(program.parent):
             to = target / Path(folder).relative_to(source)
@@ -120,6 +113,12 @@ def _link_programs(source: Path, target: Path) -> None:
                 for name in names:
                     if not (to / name).exists():
                         _link(os.path.join(folder, name), to / name)
+
+
+def give_up_programs() -> None:
+    """Have the next process begin with an empty folder: this one holds a program that cannot be read."""
+    with suppress(OSError):
+        (own_programs() / _DAMAGED).touch()
 
 
 def _link(source: str, target: Path) -> None:

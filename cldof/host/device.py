@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
@@ -263,7 +263,7 @@ class Device:
         failed: list[DeviceError] = []
         for index in candidates:
             try:
-                trials = _trials(infos[index], lanes)
+                trials = _trials(infos[index])
                 context, queue = _open(devices[index], infos[index], profiling, out_of_order)
             except DeviceError as error:
                 failed.append(error)
@@ -325,7 +325,7 @@ class Device:
 
     @cached_property
     def traits(self) -> Traits:
-        """What code may branch on; the first look runs a tiny kernel."""
+        """What code may branch on."""
         device = self._cl_device
         return Traits(
             is_cpu=self.info.kind == "cpu",
@@ -336,23 +336,42 @@ class Device:
             global_mem_bytes=device.global_mem_size,
             max_alloc_bytes=device.max_mem_alloc_size,
             local_mem_bytes=device.local_mem_size,
-            max_work_group_size=(usable := self._usable_group_size()),
-            preferred_group_limit=min(usable, _PREFERRED_GROUP_LIMIT),
+            max_work_group_size=self.found["max_work_group_size"],
+            preferred_group_limit=min(self.found["max_work_group_size"], _PREFERRED_GROUP_LIMIT),
             host_unified_memory=self.pool.shares_memory,
             supports_out_of_order=_supports_out_of_order(device),
-            has_int64_atomics=self._int64_atomics_work(),
-            has_long_loops=self._long_loops_work(),
+            has_int64_atomics=self.found["has_int64_atomics"],
+            has_long_loops=self.found["has_long_loops"],
             lanes=self.lanes,
         )
 
     @cached_property
+    def found(self) -> dict[str, Any]:
+        """Traits that take tiny kernels to find; those of the child that tried the device, if one did."""
+        known = {} if self.trials is None else self.trials.found
+        probes: dict[str, Callable[[], Any]] = {
+            "max_work_group_size": self._usable_group_size,
+            "has_int64_atomics": self._int64_atomics_work,
+            "has_long_loops": self._long_loops_work,
+            "compiled_width": lambda: self.compiled_width,
+        }
+        return {name: known[name] if name in known else probe() for name, probe in probes.items()}
+
+    @cached_property
+    def compiled_width(self) -> int:
+        """Floats in a register of the processor that the driver compiles for; 0 where it does not say."""
+        if self.trials is not None and "compiled_width" in self.trials.found:
+            return int(self.trials.found["compiled_width"])
+        found = self._probed(PROBE_SOURCE, np.zeros(1, np.uint32), 1) if self.info.kind == "cpu" else None
+        return 0 if found is None else int(found[0])
+
+    @cached_property
     def lanes(self) -> int:
-        """Floats that a work-item computes with at a time; the first look runs a tiny kernel on CPUs."""
+        """Floats that a work-item computes with at a time."""
         if self._lanes is not None:
             return self._lanes
-        is_cpu = self.info.kind == "cpu"
-        found = self._probed(PROBE_SOURCE, np.zeros(1, np.uint32), 1) if is_cpu else None
-        return lanes_for(is_cpu, 0 if found is None else int(found[0]), self._cl_device.native_vector_width_float)
+        native = self._cl_device.native_vector_width_float
+        return lanes_for(self.info.kind == "cpu", self.compiled_width, native)
 
     def finish(self) -> None:
         """Block until everything enqueued is done."""
@@ -367,6 +386,8 @@ class Device:
             if self._owned:
                 self.finish()
         finally:
+            if self.trials is not None:
+                self.trials.close()
             self.pool.close()
             self.programs.clear()
 
@@ -487,12 +508,12 @@ def _open(device: Any, info: DeviceInfo, profiling: bool, out_of_order: bool) ->
         raise DeviceError(f"device {info} cannot be opened: {error}. Choose another one.") from error
 
 
-def _trials(info: DeviceInfo, lanes: int | None) -> Trials | None:
+def _trials(info: DeviceInfo) -> Trials | None:
     """Trials of a device, after the first one; None where there are to be none."""
     if not is_wanted():
         return None
     trials = Trials(info)
-    trials.device(lanes)
+    trials.device()
     return trials
 
 
@@ -501,7 +522,7 @@ def _trials_of_adopted(device: Any) -> Trials | None:
     adopted = _info(-1, device)
     for info in list_devices():
         if info.identity == adopted.identity:
-            return _trials(info, None)
+            return _trials(info)
     return None
 
 

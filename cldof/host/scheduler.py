@@ -65,7 +65,9 @@ class _Command:
     label: str
 
 
-def compile(program: FrameProgram, device: Device, params: Mapping[str, Any] | None = None) -> Batch:
+def compile(
+    program: FrameProgram, device: Device, params: Mapping[str, Any] | None = None, *, more: bool = False
+) -> Batch:
     """Make a frame program ready to run: check, build, allocate, upload constants, set what never changes.
 
     Parameters
@@ -76,6 +78,8 @@ def compile(program: FrameProgram, device: Device, params: Mapping[str, Any] | N
     params : mapping, optional
         Of the first frame, as for :meth:`Batch.submit`: what the device has not built before is built and run with them
         in a child process first (:mod:`cldof.host.trial`). Without them it is built here at once.
+    more : bool
+        More programs of the same frame are to be compiled: the child stays for them.
 
     Returns
     -------
@@ -94,7 +98,7 @@ def compile(program: FrameProgram, device: Device, params: Mapping[str, Any] | N
     """
     hazards.check(program)
     if params is not None and device.trials is not None:
-        device.trials.program(program, params, device)
+        device.trials.program(program, params, device, more)
     with driver_errors(f"a frame cannot be made ready on {device.info.name}"):
         return Batch(program, device)
 

@@ -1,8 +1,9 @@
 """First use of a driver, in a child process: a compiler that crashes costs a message, not the caller's process.
 
-What this device, driver and processor have not built before is built and run once by ``python -m cldof.host.trial``,
-which does nothing else. If it ends well, what it built is taken over and what it ran is noted, and this process builds
-and runs it without another thought. If it dies, at whatever point, or cannot build, nothing of it is kept.
+What this device, driver and processor have not built before is built and run once by a child, which does nothing else
+(:mod:`cldof.host.trial_process`). If it ends well, what it built is taken over and what it ran is noted, and this
+process builds and runs it without another thought. If it dies, at whatever point, or cannot build, nothing of it is
+kept.
 
 Its inputs are all ones: a frame of an opaque white wall, 1 m away. Scalars and constants are those of the real frame.
 """
@@ -14,35 +15,27 @@ import json
 import os
 import pickle
 import signal
-import subprocess
 import sys
-import tempfile
 import threading
+import weakref
 from collections.abc import Iterable, Mapping
-from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ..errors import BuildError, CldofError, DeviceError, DriverError
-from .caches import adopt_programs, default_cache_dir, lent_programs, own_programs
-from .passes import FrameProgram, Role
+from ..errors import DriverError
+from .caches import default_cache_dir, give_up_programs, own_programs
+from .passes import FrameProgram
 from .processor import processor_digest, processor_name
 from .quirks import Effect, effects_of
+from .trial_process import SWITCH, Request, TrialProcess
 
 if TYPE_CHECKING:
-    from .device import Device, DeviceInfo, Traits
+    from .device import Device, DeviceInfo
 
 __all__ = ["SWITCH", "Trials", "is_wanted"]
 
-SWITCH = "CLDOF_TRIAL"
-"""Environment variable; 0 builds everything in the caller's process at once."""
-
-# The child's exit codes beside 0 and signals.
-_CANNOT_BUILD, _CANNOT_TRY = 3, 4
 _KILLED = -9
 # Lines of what a driver said before it died that go into the message.
 _LAST_LINES = 3
@@ -56,18 +49,6 @@ def is_wanted() -> bool:
     return os.environ.get(SWITCH, "1") != "0" and bool(sys.executable)
 
 
-@dataclass(frozen=True)
-class _Request:
-    """What a child is to do; without a program, to open the device and look at its traits."""
-
-    device: DeviceInfo
-    lanes: int | None
-    sources: Any
-    traits: Traits | None
-    program: FrameProgram | None
-    params: Mapping[str, Any]
-
-
 class Trials:
     """What has been tried on one device.
 
@@ -75,24 +56,53 @@ class Trials:
     ----------
     info : DeviceInfo
         Its index is that of :func:`cldof.host.device.list_devices`.
+
+    Attributes
+    ----------
+    found : dict
+        What probes of the device found in a child; empty before :meth:`device` and where no child could say.
     """
 
     def __init__(self, info: DeviceInfo) -> None:
+        self.found: dict[str, Any] = {}
         self._info = info
         self._has_own_cache = Effect.TRUSTS_CACHE in effects_of(info.platform, info.name)
         self._tried: set[str] = set()
+        # Tried by the child that waits for more, noted when that has ended.
+        self._pending: set[str] = set()
+        self._child: TrialProcess | None = None
+        self._forget: Any = None
 
-    def device(self, lanes: int | None) -> None:
-        """Have a child open the device, unless one has before.
+    def device(self) -> None:
+        """Have a child open the device and run its probes, unless one has before.
 
         Raises
         ------
         DriverError
             It died, or the driver cannot build the smallest kernel.
         """
-        self._try([self._key("device")], _Request(self._info, lanes, None, None, None, {}))
+        key = self._key("device")
+        with _lock, suppress(OSError):
+            with suppress(OSError, ValueError):
+                self.found = dict(json.loads((self._folder / key).read_text()))
+                return
+            child = TrialProcess(self._has_own_cache)
+            try:
+                child.tell(pickle.dumps(Request(self._info)))
+                # A frame's kernels come next, as a rule. A second child gets ready for them on another core, while this
+                # one works and ends. A device that is no processor may be for one process at a time.
+                if self._info.kind == "cpu" and (os.cpu_count() or 1) > 1:
+                    ahead = self._take_on(TrialProcess(self._has_own_cache))
+                    ahead.tell(pickle.dumps(Request(self._info, ahead=True)))
+                self.found = self._verdict(child, child.answer(), stays=False) or {}
+            except BaseException:
+                self._dismiss()
+                raise
+            finally:
+                child.drop()
+            self._note([key], json.dumps(self.found))
 
-    def program(self, program: FrameProgram, params: Mapping[str, Any], device: Device) -> None:
+    def program(self, program: FrameProgram, params: Mapping[str, Any], device: Device, more: bool = False) -> None:
         """Have a child build a frame's kernels and run them once, unless children have before.
 
         Parameters
@@ -102,6 +112,8 @@ class Trials:
             Of a frame, as :meth:`cldof.host.scheduler.Batch.submit` takes them.
         device : Device
             Whose kernels and traits they are.
+        more : bool
+            Kernels of the same frame are to follow: the child stays for them, and its end is looked at after the last.
 
         Raises
         ------
@@ -112,8 +124,37 @@ class Trials:
         keys = {
             self._key(source(step.source, step.defines), step.kernel, str(step.local_size)) for step in program.passes
         }
-        request = _Request(self._info, device.lanes, device.programs.directory, device.traits, program, params)
-        self._try(sorted(keys), request)
+        with _lock:
+            new = {key for key in keys - self._tried - self._pending if not (self._folder / key).exists()}
+            if not new and (more or not self._pending):
+                return
+            request = Request(self._info, program, params, device.programs.directory, device.traits)
+            try:
+                wanted = pickle.dumps(request) if new else None
+            except (pickle.PicklingError, AttributeError, TypeError):
+                return  # kernels of a caller's own that only this process can read
+            self._pending |= new
+            try:
+                with suppress(OSError):
+                    self._try(wanted, more)
+            except BaseException:
+                self._pending.clear()
+                self._dismiss()
+                raise
+            if not more:
+                self._dismiss()
+                self._note(self._pending)
+                self._pending = set()
+
+    def close(self) -> None:
+        """Let the child go that may wait for more."""
+        with _lock:
+            with suppress(DriverError):
+                if self._pending and self._waits:
+                    self._try(None, more=False)
+                    self._note(self._pending)
+            self._pending = set()
+            self._dismiss()
 
     @cached_property
     def _identity(self) -> str:
@@ -127,64 +168,74 @@ class Trials:
     def _key(self, *parts: str) -> str:
         return hashlib.sha256("\0".join((self._identity, *parts)).encode()).hexdigest()
 
-    def _try(self, keys: Iterable[str], request: _Request) -> None:
-        with _lock:
-            new = [key for key in keys if key not in self._tried and not (self._folder / key).exists()]
-            if not new:
+    @property
+    def _waits(self) -> bool:
+        return self._child is not None and self._child.is_waiting
+
+    def _try(self, wanted: bytes | None, more: bool) -> None:
+        """Have the child do it that waits, or a new one; without a request it is only to end well."""
+        child = self._child
+        if child is None or not self._waits:
+            if wanted is None:
                 return
-            try:
-                wanted = pickle.dumps(request)
-            except (pickle.PicklingError, AttributeError, TypeError):
-                return  # kernels of a caller's own that only this process can read
-            self._run(wanted)
-            self._tried.update(new)
-            with suppress(OSError):  # without notes the next process tries again
-                self._folder.mkdir(parents=True, exist_ok=True)
-                for key in new:
-                    (self._folder / key).touch()
+            child = self._take_on(TrialProcess(self._has_own_cache))
+        if wanted is not None:
+            child.tell(wanted)
+        self._verdict(child, child.answer() if wanted is not None else {"done": {}}, stays=more)
 
-    def _run(self, wanted: bytes) -> None:
-        """Have a child do it; raises what says that the driver is no good, and passes over what does not."""
-        environment = {
-            **os.environ,
-            SWITCH: "0",
-            "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-        }
-        with suppress(OSError), lent_programs() if self._has_own_cache else nullcontext() as lent:
-            if lent is not None:
-                environment["POCL_CACHE_DIR"] = str(lent)
-            with tempfile.TemporaryFile() as errors:
-                child = subprocess.run(
-                    _command(), input=wanted, stdout=subprocess.PIPE, stderr=errors, env=environment, check=False
-                )
-                errors.seek(0)
-                said = errors.read().decode(errors="replace")
-            told = [json.loads(line) for line in child.stdout.splitlines() if line.startswith(b"{")]
-            # What ends before it begins, or is killed from outside for its memory, says nothing of the driver.
-            if told and child.returncode not in (0, _CANNOT_TRY, _KILLED):
-                raise self._error(child.returncode, told, said)
-            if child.returncode == 0 and lent is not None:
-                adopt_programs(lent)
+    def _verdict(self, child: TrialProcess, answer: dict[str, Any] | None, stays: bool) -> Any:
+        """Take over what a child built that answers; raises what says that the driver is no good, else None."""
+        if answer is not None and "cannot build" in answer:
+            raise self._cannot_build(answer["cannot build"])
+        if answer is not None and "cannot try" in answer:
+            return None
+        code = 0 if answer is not None and stays else child.end()
+        # What ends before it begins, or is killed from outside for its memory, says nothing of the driver.
+        if child.told and code not in (0, _KILLED):
+            if child.has_given:
+                give_up_programs()
+            raise self._died(code, child)
+        if answer is None:
+            return None
+        child.adopt()
+        return answer["done"]
 
-    def _error(self, code: int, told: list[dict[str, str]], said: str) -> DriverError:
-        on = f"on device {self._info}, processor {processor_name()}"
-        report = next((line["error"] for line in told if "error" in line), None)
-        if code == _CANNOT_BUILD and report is not None:
-            return DriverError(
-                f"the driver cannot build for this processor, or not this kernel, {on}. Choose another device or "
-                f"install another driver (`cldof devices` lists what there is, `cldof doctor` what works). {report}"
-            )
-        stage = next((line["stage"] for line in reversed(told) if "stage" in line), "starting")
-        last = "".join(f"\n  {line}" for line in said.strip().splitlines()[-_LAST_LINES:])
+    def _take_on(self, child: TrialProcess) -> TrialProcess:
+        """Keep a child for what comes, until this object goes or the process ends."""
+        self._dismiss()
+        self._child, self._forget = child, weakref.finalize(self, child.drop)
+        return child
+
+    def _dismiss(self) -> None:
+        if self._forget is not None:
+            self._forget()
+        self._child = self._forget = None
+
+    def _note(self, keys: Iterable[str], text: str = "") -> None:
+        self._tried.update(keys)
+        with suppress(OSError):  # without notes the next process tries again
+            self._folder.mkdir(parents=True, exist_ok=True)
+            for key in keys:
+                (self._folder / key).write_text(text)
+
+    def _cannot_build(self, report: str) -> DriverError:
         return DriverError(
-            f"the driver died while {stage}: {_how(code)}, {on}. That was a child process; nothing of it was kept. "
-            "Choose another device or install another driver (`cldof devices` lists what there is, `cldof doctor` what "
-            f"works), and report this message to us{f'. It said last:{last}' if last else '.'}"
+            f"the driver cannot build for this processor, or not this kernel, {self._place}. Choose another device or "
+            f"install another driver (`cldof devices` lists what there is, `cldof doctor` what works). {report}"
         )
 
+    def _died(self, code: int, child: TrialProcess) -> DriverError:
+        stage = next((line["stage"] for line in reversed(child.told) if "stage" in line), "starting")
+        last = "".join(f"\n  {line}" for line in child.last_words(_LAST_LINES))
+        return DriverError(
+            f"the driver died while {stage}: {_how(code)}, {self._place}. That was a child process; nothing of it was "
+            "kept. Choose another device or install another driver (`cldof devices` lists what there is, "
+            f"`cldof doctor` what works), and report this message to us{f'. It said last:{last}' if last else '.'}"
+        )
 
-def _command() -> list[str]:
-    return [sys.executable, "-m", "cldof.host.trial"]
+    @property
+    def _place(self) -> str:
+        return f"on device {self._info}, processor {processor_name()}"
 
 
 def _how(code: int) -> str:
@@ -194,58 +245,3 @@ def _how(code: int) -> str:
         return signal.Signals(-code).name
     except ValueError:
         return f"signal {-code}"
-
-
-def main() -> int:
-    """The child: do what is asked for on standard input, and say on standard output how far it got."""
-    # Drivers write to both streams; the parent reads the first.
-    out = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)
-
-    def stage(what: str) -> None:
-        print(json.dumps({"stage": what}), file=out)
-
-    request: _Request = pickle.load(sys.stdin.buffer)
-    try:
-        _carry_out(request, stage)
-        stage("ending")
-    except BuildError as error:
-        print(json.dumps({"error": str(error)}), file=out)
-        return _CANNOT_BUILD
-    except CldofError:  # too little memory for two, a device that one process has for itself
-        return _CANNOT_TRY
-    return 0
-
-
-def _carry_out(request: _Request, stage: Any) -> None:
-    from .device import Device
-    from .scheduler import compile
-
-    stage("opening the device")
-    with Device.open(request.device.index, sources=request.sources, lanes=request.lanes) as device:
-        if device.info.identity != request.device.identity:
-            raise DeviceError(f"device {request.device} is {device.info} in another process")
-        if request.program is None:
-            stage("trying a small kernel")
-            _ = device.traits
-            return
-        if request.traits is not None:
-            device.__dict__["traits"] = request.traits
-        program = request.program
-        for source, defines in dict.fromkeys((step.source, step.defines) for step in program.passes):
-            stage(f"building {source}.cl")
-            device.programs.program(source, defines)
-        stage("making a frame of " + ", ".join(dict.fromkeys(step.kernel for step in program.passes)))
-        with compile(program, device) as batch:
-            stage("running " + ", ".join(dict.fromkeys(step.kernel for step in program.passes)))
-            inputs = {
-                name: device.pool.to_device(np.ones(-(-buffer.nbytes // 4), np.float32))
-                for name, buffer in program.buffers.items()
-                if buffer.role is Role.INPUT
-            }
-            waits = [event for one in inputs.values() for event in one.waits]
-            batch.submit({name: one.buffer for name, one in inputs.items()}, request.params, waits).wait()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

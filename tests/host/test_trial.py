@@ -15,7 +15,7 @@ import pytest
 from cldof import Lens, Renderer
 from cldof.errors import DriverError, DriverWarning
 from cldof.host import device as device_module
-from cldof.host import trial
+from cldof.host import trial, trial_process
 from cldof.host.device import Device, DeviceInfo, list_devices
 from tests.frames import noise_frame
 from tests.tools import feigned
@@ -33,7 +33,7 @@ PLACES = {
 }
 DYING_CHILD = """
 import ctypes, os, sys
-from cldof.host import trial
+from cldof.host import trial, trial_process
 from cldof.host.device import Device
 from cldof.host.program import ProgramCache
 from cldof.host.scheduler import Batch
@@ -43,7 +43,7 @@ def die(*args, **options):
 
 if "{place}":
     setattr({owner}, "{name}", die)
-trial.main()
+trial_process.main()
 die()
 """
 
@@ -58,35 +58,45 @@ def trials_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def children(monkeypatch: pytest.MonkeyPatch, code: str | None = None) -> list[list[str]]:
     """Commands that are started from here on; `code` replaces what children do."""
     started: list[list[str]] = []
-    command = trial._command()
+    command = trial_process.command()
 
     def noted() -> list[str]:
         started.append(command if code is None else [sys.executable, "-c", code])
         return started[-1]
 
-    monkeypatch.setattr(trial, "_command", noted)
+    monkeypatch.setattr(trial_process, "command", noted)
     return started
 
 
 def test_a_frame_is_tried_once(
     trials_on: None, monkeypatch: pytest.MonkeyPatch, device_info: DeviceInfo, tmp_path: Path
 ) -> None:
-    """Device, preparation and method; the second renderer knows, and so does another process, by the notes."""
+    """A child for the device, one for preparation and method; the second renderer knows, as other processes do."""
     started = children(monkeypatch)
     with Renderer("layered", device=device_info.index) as renderer:
         image = renderer.render(FRAME, LENS).image
-        assert len(started) == 3
+        assert len(started) == 2
         renderer.render(FRAME, Lens(1.01 * LENS.aperture_radius_m, 2.0))
+        traits = renderer.device.traits
     with Renderer("layered", device=device_info.index) as renderer:
         np.testing.assert_array_equal(renderer.render(FRAME, LENS).image, image)
-    assert len(started) == 3
+    assert len(started) == 2
     assert (tmp_path / "tried").is_dir()
     with Renderer("gather", device=device_info.index) as renderer:
         renderer.render(FRAME, LENS)
-    assert len(started) == 4, "another method, the same device and preparation"
+    assert len(started) == 3, "another method, the same device and preparation"
     monkeypatch.setenv(trial.SWITCH, "0")
     with Renderer("layered", device=device_info.index) as renderer:
         np.testing.assert_array_equal(renderer.render(FRAME, LENS).image, image)
+        assert renderer.device.traits == traits, "by probes of this process, which before were the child's"
+
+
+def test_only_what_a_child_has_ended_after_is_noted(trials_on: None, device_info: DeviceInfo, tmp_path: Path) -> None:
+    """The child that prepared a frame waits for the frame's own kernels; without any it ends with the device."""
+    with Renderer("gather", device=device_info.index) as renderer:
+        renderer.stats(FRAME)
+        assert len(list((tmp_path / "tried").iterdir())) == 1, "the device"
+    assert len(list((tmp_path / "tried").iterdir())) > 1
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such signals")
@@ -95,7 +105,8 @@ def test_a_frame_is_tried_once(
 def test_a_child_that_dies_is_a_message(
     trials_on: None, monkeypatch: pytest.MonkeyPatch, device_info: DeviceInfo, tmp_path: Path, place: str, signal: str
 ) -> None:
-    with Renderer("layered", device=device_info.index) as renderer:
+    with Renderer("gather", device=device_info.index) as renderer:
+        renderer.device.trials.close()  # one waits for a frame
         owner, _, name = place.rpartition(".")
         children(monkeypatch, DYING_CHILD.format(place=place, owner=owner or "None", name=name, signal=signal))
         # Any frame; what the device itself was tried with is known.
@@ -108,7 +119,7 @@ def test_a_child_that_dies_is_a_message(
     monkeypatch.undo()
     monkeypatch.setenv(trial.SWITCH, "1")
     monkeypatch.setattr(trial.Trials, "_folder", tmp_path / "tried")
-    with Renderer("layered", device=device_info.index) as renderer:
+    with Renderer("gather", device=device_info.index) as renderer:
         assert np.isfinite(renderer.render(FRAME, LENS).image).all(), "the next one works"
 
 
@@ -120,13 +131,14 @@ def two_devices(monkeypatch: pytest.MonkeyPatch, info: DeviceInfo) -> None:
 
 
 def failing_first(monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
-    """Trials that go wrong on device 0 alone."""
+    """Trials that go wrong on device 0 alone, and find nothing out on others."""
 
-    def run(self: trial.Trials, wanted: bytes) -> None:
-        if self._info.index == 0 and (fails == "device") == (trial.pickle.loads(wanted).program is None):
+    def tried(self: trial.Trials, *args: Any, **options: Any) -> None:
+        if self._info.index == 0 and fails == ("program" if args else "device"):
             raise DriverError("the driver died")
 
-    monkeypatch.setattr(trial.Trials, "_run", run)
+    monkeypatch.setattr(trial.Trials, "device", tried)
+    monkeypatch.setattr(trial.Trials, "program", tried)
 
 
 @pytest.mark.parametrize("fails", ["device", "program"])
@@ -135,10 +147,11 @@ def test_the_next_device_is_taken_where_the_choice_is_ours(
     trials_on: None, monkeypatch: pytest.MonkeyPatch, device_info: DeviceInfo, fails: str, method: str
 ) -> None:
     options: dict[str, Any] = {"max_error": 0.05} if method == "auto" else {}
+    monkeypatch.setenv(trial.SWITCH, "0")
     with Renderer(method, device=device_info.index, **options) as renderer:
         expected = renderer.render(FRAME, LENS).image
+    monkeypatch.setenv(trial.SWITCH, "1")
     two_devices(monkeypatch, device_info)
-    monkeypatch.setattr(trial.Trials, "_key", lambda self, *parts: f"{self._info.index} {hash(parts)}")
     failing_first(monkeypatch, fails)
     with pytest.warns(DriverWarning, match=r"the driver died.* taken in its place"):
         renderer = Renderer(method, **options)
@@ -157,8 +170,8 @@ def test_what_says_nothing_of_the_driver_is_passed_over(
     """Children that cannot be started, that end before they begin, and that are killed for their memory."""
     killed = 'import os\nprint("{\\"stage\\": \\"running\\"}", flush=True)\nos.kill(os.getpid(), 9)'
     for command in (["/does/not/exist"], [sys.executable, "-c", "raise SystemExit(1)"], [sys.executable, "-c", killed]):
-        monkeypatch.setattr(trial, "_command", lambda command=command: command)
-        trial.Trials(device_info).device(None)
+        monkeypatch.setattr(trial_process, "command", lambda command=command: command)
+        trial.Trials(device_info).device()
 
 
 def _python(code: str, variables: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
@@ -256,6 +269,7 @@ def test_a_poisoned_cache_is_made_anew(tmp_path: Path, saved: str) -> None:
 def test_a_child_finds_what_this_process_finds(trials_on: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """An adopted queue is tried on the device that it is of."""
     started = children(monkeypatch)
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # no second child meanwhile
     for info in list_devices():
         with Device.open(info.index) as own, Device.adopt(queue=own.queue) as adopted:
             assert adopted.trials is not None
