@@ -161,14 +161,24 @@ class _Tools:
     def ptx(self, source: str, output: Path) -> str:
         """Compile to PTX; what there is to say against it."""
         command = [self.clang, "-x", "cl", "-cl-std=CL1.2", "--target=nvptx64--nvidiacl", "-w", "-O3"]
-        for word in ("-target-cpu", _PTX_TARGET, "-mlink-builtin-bitcode", self.libclc):
+        for word in ("-cl-ext=+cl_khr_int64_extended_atomics", "-target-cpu", _PTX_TARGET):
+            command += ["-Xclang", word]
+        for word in ("-mlink-builtin-bitcode", self.libclc):
             command += ["-Xclang", word]
         # GPU drivers inline every function.
         command += ["-mllvm", "-inline-threshold=1000000", "-S", "-o", str(output), "-"]
-        done = subprocess.run(command, input=source, capture_output=True, text=True)
+        done = subprocess.run(command, input=_ATOM_MIN + source, capture_output=True, text=True)
         return (done.stderr.strip() or f"code {done.returncode}") if done.returncode else ""
 
 
+# NVIDIA's devices have it, libclc does not.
+_ATOM_MIN = """__attribute__((overloadable)) ulong atom_min(volatile __global ulong *at, ulong value)
+{
+    ulong before;
+    __asm__ volatile("atom.global.min.u64 %0, [%1], %2;" : "=l"(before) : "l"(at), "l"(value) : "memory");
+    return before;
+}
+"""
 _TRIVIAL = "__kernel void trivial(__global float *o) { o[get_global_id(0)] = exp(o[0]) + rsqrt(o[1]); }\n"
 
 
